@@ -1,0 +1,41 @@
+# Each target does all of its own set-up in a virtual environment here (.venv); Python 3.11 or newer is enough.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+
+.PHONY: demo test lint types package bench clean
+
+demo: $(VENV)/.stamp
+	$(BIN)/marcha demo -o demo --force $(if $(SHOW),--show)
+
+test: $(VENV)/.stamp-dev
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.stamp-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+# pyright reads `marcha.<folder>` of the tests through one link to this folder.
+types: $(VENV)/.stamp-dev
+	mkdir -p .pyright && ln -sfn .. .pyright/marcha
+	$(BIN)/pyright
+
+package: $(VENV)/.stamp-dev
+	$(BIN)/python tests/check_package.py
+
+bench: $(VENV)/.stamp-dev
+	$(BIN)/python -m benchmarks
+
+$(VENV)/.stamp: pyproject.toml
+	$(PYTHON) -c "import sys; sys.exit('marcha needs Python 3.11 or newer; set PYTHON=python3.x' if sys.version_info < (3, 11) else 0)"
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install -q --upgrade "pip>=25.1"
+	$(BIN)/python -m pip install -q -e .
+	touch $@
+
+$(VENV)/.stamp-dev: $(VENV)/.stamp
+	$(BIN)/python -m pip install -q --group dev
+	touch $@
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pyright
