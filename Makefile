@@ -18,7 +18,7 @@ lint: $(VENV)/.stamp-dev
 # pyright reads `marcha.<folder>` of the tests through one link to this folder.
 types: $(VENV)/.stamp-dev
 	mkdir -p .pyright && ln -sfn .. .pyright/marcha
-	$(BIN)/pyright
+	$(BIN)/pyright --pythonpath $(BIN)/python
 
 package: $(VENV)/.stamp-dev
 	$(BIN)/python tests/check_package.py
@@ -38,4 +38,4 @@ $(VENV)/.stamp-dev: $(VENV)/.stamp
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .pyright
+	rm -rf $(VENV) demo build dist *.egg-info .pyright

@@ -1,7 +1,7 @@
 """Print the benchmark table: ``python -m benchmarks [--scale 0.1] [--only recording] [--json FILE]``.
 
-Figures are ratios against a peer in the same run: machines differ, ratios much less. ``--scale`` shrinks the inputs for a quick look; the
-targets are promised at scale 1.
+Figures are ratios against a peer in the same run: machines differ, ratios much less. ``--scale`` shrinks
+the inputs for a quick look; the targets are promised at scale 1.
 """
 
 from __future__ import annotations
@@ -26,11 +26,10 @@ def _number(value: float | None) -> str:
 
 def _table(rows: list[Row]) -> str:
     head = ("what", "ours", "unit", "peer", "theirs", "ratio", "target", "met")
-    cells = [
-        (r.name, _number(r.ours), r.unit, r.peer, _number(r.theirs), _number(r.ratio), r.target)
-        + ("yes" if r.met else "NO",)
-        for r in rows
-    ]
+    cells = []
+    for r in rows:
+        numbers = (_number(r.ours), r.unit, r.peer, _number(r.theirs), _number(r.ratio))
+        cells.append((r.name, *numbers, r.target, "yes" if r.met else "NO"))
     widths = [max(len(row[i]) for row in [head, *cells]) for i in range(len(head))]
     lines = [head, tuple("-" * w for w in widths), *cells]
     return "\n".join(

@@ -1,0 +1,127 @@
+"""The house: which room may import which, and that every room is shipped."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from .conftest import ROOT
+
+ROOMS = ("ingest", "recording", "algorithms", "replay", "viz", "export", "cli")
+MAY_IMPORT = {
+    "recording": set(),
+    "algorithms": set(),
+    "ingest": {"recording"},
+    "export": {"recording"},
+    "replay": {"recording", "algorithms"},
+    "viz": {"recording", "replay", "export"},  # export: only for the contract that its RRD exporter fulfils
+    "cli": set(ROOMS) - {"cli"},
+}
+SOURCES = sorted(p for room in ROOMS for p in (ROOT / room).rglob("*.py"))
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+
+
+def imports(path: Path) -> list[tuple[int, str]]:
+    """Return (line, absolute dotted name below marcha or outside) of every import, lazy ones too."""
+    package = path.relative_to(ROOT).parent.parts
+    found = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found += [(node.lineno, alias.name) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            if node.level == 0:
+                found.append((node.lineno, node.module or ""))
+                continue
+            base = ("marcha", *package)[: len(package) + 2 - node.level]
+            module = ".".join((*base, *(node.module.split(".") if node.module else ())))
+            names = [f"{module}.{alias.name}" for alias in node.names] if module == "marcha" else [module]
+            found += [(node.lineno, name) for name in names]
+    return found
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_imports_point_against_the_data_flow(path: Path) -> None:
+    room = path.relative_to(ROOT).parts[0]
+    for line, name in imports(path):
+        parts = name.split(".")
+        if parts[0] == "marcha" and len(parts) > 1 and parts[1] in ROOMS and parts[1] != room:
+            assert parts[1] in MAY_IMPORT[room], f"{path}:{line}: {room} may not import {parts[1]}"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_cross_room_imports_are_relative(path: Path) -> None:
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        names = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            names = [node.module or ""]
+        assert not any(n.split(".")[0] in ("marcha", *ROOMS) for n in names), f"{path}:{node.lineno}"
+
+
+def test_only_viz_imports_rerun() -> None:
+    users = {
+        p.relative_to(ROOT).parts[0] for p in SOURCES for _, n in imports(p) if n.split(".")[0] == "rerun"
+    }
+    assert users <= {"viz"}
+
+
+def test_every_package_folder_is_listed() -> None:
+    folders = {p.parent.relative_to(ROOT) for p in SOURCES if p.name == "__init__.py"}
+    setuptools = PYPROJECT["tool"]["setuptools"]
+    expected = {"marcha." + ".".join(f.parts): f.as_posix() for f in folders}
+    expected["marcha.tests.contracts"] = "tests/contracts"  # shipped: plug-in authors inherit them
+    assert set(setuptools["packages"]) == set(expected)
+    assert setuptools["package-dir"] == expected
+
+
+def test_every_module_lies_in_a_listed_package() -> None:
+    listed = set(PYPROJECT["tool"]["setuptools"]["package-dir"].values())
+    assert {p.parent.relative_to(ROOT).as_posix() for p in SOURCES} <= listed
+
+
+ENTRY_POINTS = [
+    (group, name, target)
+    for group, names in PYPROJECT["project"]["entry-points"].items()
+    for name, target in names.items()
+]
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "target"), ENTRY_POINTS, ids=[f"{g}:{n}" for g, n, _ in ENTRY_POINTS]
+)
+def test_entry_point_loads(group: str, name: str, target: str) -> None:
+    import importlib
+
+    module, _, attribute = target.partition(":")
+    assert getattr(importlib.import_module(module), attribute) is not None
+
+
+def test_help_imports_nothing_heavy() -> None:
+    code = (
+        "import sys, marcha.cli as c\n"
+        "try: c.main(['--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'rerun', 'numba', 'polars', 'scipy', 'matplotlib', 'ezc3d', 'pyproj', 'mcap'}\n"
+        "heavy &= set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_nothing_names_a_machine() -> None:
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False)
+    if listed.returncode:
+        pytest.skip("not a git checkout")
+    here = str(ROOT.parent)
+    for name in listed.stdout.split():
+        path = ROOT / name
+        if path.suffix in {".py", ".md", ".toml", ".yml", ""} and path.is_file() and len(here) > 3:
+            assert here + "/" not in path.read_text(encoding="utf-8", errors="ignore"), name
