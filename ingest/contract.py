@@ -1,0 +1,289 @@
+"""What an importer is: it recognises a raw log by its content and streams it as channels, with a report.
+
+An importer never writes files and never asks. It hands over tables in SI units, time stamps in int64
+nanoseconds that never decrease within a channel, and a report in which every row of the source is either kept
+or dropped for a named reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Protocol, runtime_checkable
+
+import msgspec
+import polars as pl
+
+from ..recording.errors import Finding
+
+#: Finding kinds that mean that the source itself lost data: the user should know (exit code 3).
+LOSS_KINDS = frozenset({"clipped", "gap", "lost_bytes", "missing_cell", "all_zero", "constant"})
+
+
+class CommonOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options that every importer takes; an importer's ``Options`` inherits from it.
+
+    ``convert`` acts on these fields itself; an importer needs not look at them.
+    """
+
+    closed: Annotated[
+        bool | None, msgspec.Meta(description="the walk ends where it began (truth for the closure metric)")
+    ] = None
+    length_m: Annotated[
+        float | None, msgspec.Meta(gt=0, description="true length of the walk in metres, where it is known")
+    ] = None
+    epoch: Annotated[
+        str | None,
+        msgspec.Meta(description="UTC time (ISO 8601) of the device clock's zero; makes the clock UTC"),
+    ] = None
+    start: Annotated[
+        str | None, msgspec.Meta(description="UTC time (ISO 8601) of the first sample; makes the clock UTC")
+    ] = None
+    keep_source: Annotated[bool, msgspec.Meta(description="attach the raw source files to the recording")] = (
+        False
+    )
+
+
+class ChannelSpec(msgspec.Struct, frozen=True):
+    """One channel that an import will deliver.
+
+    Attributes
+    ----------
+    topic : str
+        ``/<device>/<sensor>``, for example ``/foot/imu1``.
+    schema : str
+        Message type, a key of :data:`marcha.recording.SCHEMAS`.
+    frame_id : str
+        Name of the frame in which vectors are given.
+    columns : tuple of str
+        Columns beside ``t_ns``; needed only where the schema's columns are named by the data (joints).
+    metadata : dict of str to str
+        Device configuration of this channel: full scales, rate, mounting …
+    """
+
+    topic: str
+    schema: str
+    frame_id: str = ""
+    columns: tuple[str, ...] = ()
+    metadata: dict[str, str] = {}
+
+
+class SourceAttachment(msgspec.Struct, frozen=True):
+    """Something to attach to the recording.
+
+    Attributes
+    ----------
+    name, media_type : str
+        File name and media type.
+    data : bytes
+        Content.
+    """
+
+    name: str
+    data: bytes
+    media_type: str
+
+
+class Report(msgspec.Struct, frozen=True):
+    """What became of the rows of a source.
+
+    Attributes
+    ----------
+    rows_read : int
+        Rows of the source that should hold data: ``rows_kept + rows_dropped``.
+    rows_kept : int
+        Rows that became messages, repaired ones included.
+    rows_repaired : int
+        Kept rows of which something was changed (time, missing cells).
+    rows_dropped : int
+        Rows that became nothing.
+    findings : list of Finding
+        Why, and what else the user should know.
+    """
+
+    rows_read: int
+    rows_kept: int
+    rows_repaired: int
+    rows_dropped: int
+    findings: list[Finding]
+
+    @property
+    def lossy(self) -> bool:
+        """Whether data was lost or repaired in a way that the user should know."""
+        return bool(
+            self.rows_repaired or self.rows_dropped or any(f.kind in LOSS_KINDS for f in self.findings)
+        )
+
+
+class ReportBuilder:
+    """Counts rows and merges findings while an import streams.
+
+    Findings of one kind and subject are one entry: counts add up, the first line and its detail stay.
+    """
+
+    def __init__(self) -> None:
+        self.kept = 0
+        self.repaired = 0
+        self.dropped = 0
+        self._findings: dict[tuple[str, str], Finding] = {}
+
+    def keep(self, rows: int) -> None:
+        """Count ``rows`` that became messages."""
+        self.kept += int(rows)
+
+    def drop(
+        self, kind: str, detail: str, *, count: int = 1, line: int | None = None, subject: str = ""
+    ) -> None:
+        """Count rows that become nothing, and say why."""
+        self.dropped += int(count)
+        self.note(kind, detail, count=count, line=line, subject=subject)
+
+    def repair(
+        self,
+        kind: str,
+        detail: str,
+        *,
+        count: int = 1,
+        rows: int | None = None,
+        line: int | None = None,
+        subject: str = "",
+    ) -> None:
+        """Say what was changed; ``rows`` (default ``count``) of the kept rows were touched."""
+        self.repaired += int(count if rows is None else rows)
+        self.note(kind, detail, count=count, line=line, subject=subject)
+
+    def note(
+        self, kind: str, detail: str, *, count: int = 1, line: int | None = None, subject: str = ""
+    ) -> None:
+        """Say something about rows that stay as they are."""
+        if not count:
+            return
+        old = self._findings.get((kind, subject))
+        line = None if line is None else int(line)
+        if old is None:
+            self._findings[kind, subject] = Finding(kind, int(count), line, detail)
+            return
+        earlier = line is not None and (old.first_line is None or line < old.first_line)
+        self._findings[kind, subject] = Finding(
+            kind,
+            old.count + int(count),
+            line if earlier else old.first_line,
+            detail if earlier else old.detail,
+        )
+
+    def build(self) -> Report:
+        """Return the report, findings ordered by kind and first line."""
+        findings = sorted(
+            self._findings.values(), key=lambda f: (f.kind, -1 if f.first_line is None else f.first_line)
+        )
+        return Report(
+            rows_read=self.kept + self.dropped,
+            rows_kept=self.kept,
+            rows_repaired=min(self.repaired, self.kept),
+            rows_dropped=self.dropped,
+            findings=findings,
+        )
+
+
+class Import:
+    """One source being read: declared channels, a stream of tables, and what is known once it has ended.
+
+    Parameters
+    ----------
+    channels : sequence of ChannelSpec
+        All channels that the stream may deliver. A declared channel may stay empty.
+    blocks : iterable of (str, polars.DataFrame)
+        Topic and table (``t_ns`` Int64 first, then the schema's columns) of some thousand rows each, read
+        lazily, so that memory stays bounded. Time never decreases within a topic.
+    report : ReportBuilder
+        Filled while the blocks are read.
+    metadata : dict of str to dict of str to str
+        Metadata records, above all ``device`` (with ``clock``: ``device``, ``utc`` or ``unix``). May be
+        completed while the blocks are read.
+    attachments : list of SourceAttachment
+        Same rule.
+    """
+
+    def __init__(
+        self,
+        *,
+        channels: Sequence[ChannelSpec],
+        blocks: Iterable[tuple[str, pl.DataFrame]],
+        report: ReportBuilder,
+        metadata: dict[str, dict[str, str]] | None = None,
+        attachments: list[SourceAttachment] | None = None,
+    ) -> None:
+        self.channels = tuple(channels)
+        self.metadata = metadata if metadata is not None else {}
+        self.attachments = attachments if attachments is not None else []
+        self._blocks = blocks
+        self._builder = report
+        self._done = False
+
+    def blocks(self) -> Iterator[tuple[str, pl.DataFrame]]:
+        """Yield (topic, table) until the source ends; can be read once."""
+        yield from self._blocks
+        self._blocks = ()
+        self._done = True
+
+    @property
+    def report(self) -> Report:
+        """The finished report.
+
+        Raises
+        ------
+        RuntimeError
+            Before the blocks have been exhausted: it would be incomplete.
+        """
+        if not self._done:
+            raise RuntimeError("the report is complete only after all blocks have been read")
+        return self._builder.build()
+
+
+@runtime_checkable
+class Importer(Protocol):
+    """One raw format. A module a format, registered as an entry point ``marcha.importers``.
+
+    Attributes
+    ----------
+    name : str
+        What users type after ``--format``.
+    title : str
+        One line for ``marcha formats``.
+    Options : type of CommonOptions
+        Options of this format, each with a description; its docstring is shown by ``marcha formats``.
+    joins : bool
+        Whether several inputs given together are pieces of one recording, in the order given. Optional; false
+        where it is missing.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    Options: ClassVar[type[CommonOptions]]
+
+    def sniff(self, head: bytes, path: Path) -> float:
+        """Tell how surely this is the format, from content.
+
+        Parameters
+        ----------
+        head : bytes
+            The first 64 KiB of a file; empty for a folder.
+        path : Path
+            The file or folder itself.
+
+        Returns
+        -------
+        float
+            0 no … 1 certain.
+        """
+        ...
+
+    def read(self, paths: Sequence[Path], options: Any) -> Import:
+        """Open the source and declare its channels; rows are read by the blocks.
+
+        Raises
+        ------
+        MarchaError
+            Where the source cannot be read as this format; one line with file, line, rule, value, remedy.
+        """
+        ...
