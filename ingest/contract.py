@@ -16,9 +16,6 @@ import polars as pl
 
 from ..recording.errors import Finding
 
-#: Finding kinds that mean that the source itself lost data: the user should know (exit code 3).
-LOSS_KINDS = frozenset({"clipped", "gap", "lost_bytes", "missing_cell", "all_zero", "constant"})
-
 
 class CommonOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options that every importer takes; an importer's ``Options`` inherits from it.
@@ -99,6 +96,9 @@ class Report(msgspec.Struct, frozen=True):
         Rows that became nothing.
     findings : list of Finding
         Why, and what else the user should know.
+    lossy : bool
+        Whether data was lost or repaired in a way that the user should know (exit code 3): rows were dropped or
+        repaired, or the sensor itself lost data (clipping, long gaps).
     """
 
     rows_read: int
@@ -106,13 +106,7 @@ class Report(msgspec.Struct, frozen=True):
     rows_repaired: int
     rows_dropped: int
     findings: list[Finding]
-
-    @property
-    def lossy(self) -> bool:
-        """Whether data was lost or repaired in a way that the user should know."""
-        return bool(
-            self.rows_repaired or self.rows_dropped or any(f.kind in LOSS_KINDS for f in self.findings)
-        )
+    lossy: bool
 
 
 class ReportBuilder:
@@ -125,6 +119,7 @@ class ReportBuilder:
         self.kept = 0
         self.repaired = 0
         self.dropped = 0
+        self._lost = False
         self._findings: dict[tuple[str, str], Finding] = {}
 
     def keep(self, rows: int) -> None:
@@ -150,6 +145,13 @@ class ReportBuilder:
     ) -> None:
         """Say what was changed; ``rows`` (default ``count``) of the kept rows were touched."""
         self.repaired += int(count if rows is None else rows)
+        self.note(kind, detail, count=count, line=line, subject=subject)
+
+    def loss(
+        self, kind: str, detail: str, *, count: int = 1, line: int | None = None, subject: str = ""
+    ) -> None:
+        """Say that the source itself lost data here (clipping, a long gap); the rows stay as they are."""
+        self._lost = self._lost or count > 0
         self.note(kind, detail, count=count, line=line, subject=subject)
 
     def note(
@@ -182,6 +184,7 @@ class ReportBuilder:
             rows_repaired=min(self.repaired, self.kept),
             rows_dropped=self.dropped,
             findings=findings,
+            lossy=bool(self._lost or self.repaired or self.dropped),
         )
 
 
