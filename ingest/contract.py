@@ -16,6 +16,9 @@ import polars as pl
 
 from ..recording.errors import Finding
 
+#: Bytes of a file that :meth:`Importer.sniff` is shown.
+HEAD_BYTES = 65536
+
 
 class CommonOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options that every importer takes; an importer's ``Options`` inherits from it.
@@ -97,8 +100,8 @@ class Report(msgspec.Struct, frozen=True):
     findings : list of Finding
         Why, and what else the user should know.
     lossy : bool
-        Whether data was lost or repaired in a way that the user should know (exit code 3): rows were dropped or
-        repaired, or the sensor itself lost data (clipping, long gaps).
+        Whether data was lost or repaired in a way that the user should know (exit code 3): rows were dropped
+        or repaired, or the sensor itself lost data (clipping, long gaps).
     """
 
     rows_read: int

@@ -1,0 +1,279 @@
+"""Repair of a device's time column, block by block, every repair named."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from .contract import ReportBuilder
+
+Int64Array = NDArray[np.int64]
+
+#: A run of fewer rows whose time stands back is a slip of those rows; a longer one is a clock set anew.
+SLIP_ROWS = 20
+#: Intervals longer than this many nominal ones miss a row; longer than LONG_GAP ones, the source lost data.
+GAP, LONG_GAP = 1.8, 10.0
+#: Intervals off the nominal one by more than this share (and more than one tick) are jitter.
+JITTER = 0.1
+#: A counter that wraps goes on within this time of its last value; anything else is a step back.
+ROLLOVER_S = 3600.0
+
+
+class Clock:
+    """Turns a column of device ticks into time stamps that never decrease.
+
+    What it does, and under which name it reports:
+
+    ``counter_rollover``
+        the counter wrapped: the rows that follow are moved by its period (repair).
+    ``duplicate_row``
+        a row equal to the one before in every column: dropped.
+    ``duplicate_time``
+        equal time, other values: kept as it is.
+    ``backwards_time``
+        fewer than 20 rows stand before their predecessor: dropped; a short run that jumps ahead and comes
+        back is dropped likewise; a longer run is a clock that started again: it and all that follows is moved
+        to one nominal interval behind the last row (repair).
+    ``gap``, ``jitter``
+        intervals above 1.8 nominal ones, and intervals off by more than 10 %: reported, nothing is filled in.
+
+    Parameters
+    ----------
+    report : ReportBuilder
+        Where findings go; rows that :meth:`feed` returns are counted as kept.
+    tick_ns : int
+        Nanoseconds of one tick.
+    period : int, optional
+        Number of ticks after which the counter wraps (2**32 for ``millis()``).
+    subject : str
+        Which clock, where a source has several: it stands before each detail.
+    even : bool
+        Whether the device samples at a fixed rate, so that gaps and jitter mean something.
+
+    Notes
+    -----
+    A frame that is fed has ``t`` (Int64, ticks), ``line`` (Int64) and any other columns; what returns has
+    ``t_ns`` in the place of ``t``. Rows that cannot be judged before the next block are held back: call with
+    ``final=True`` at the end.
+    """
+
+    def __init__(
+        self,
+        report: ReportBuilder,
+        *,
+        tick_ns: int,
+        period: int | None = None,
+        subject: str = "",
+        even: bool = True,
+    ) -> None:
+        self._report = report
+        self._tick_ns = tick_ns
+        self._period = period
+        self._subject = subject
+        self._even = even
+        self._raw: int | None = None  # last raw tick
+        self._turns = 0  # ticks added by roll-overs
+        self._shift = 0  # ticks added by restarts
+        self._last: int | None = None  # last tick handed out, after both
+        self._last_row: tuple[object, ...] | None = None
+        self._held: pl.DataFrame | None = None
+        self._nominal: int | None = None
+        self._longest = [0, 0]  # of gap and jitter intervals, ticks
+        self._where: list[int | None] = [None, None]
+        self._counts = [0, 0]
+
+    @property
+    def nominal_ns(self) -> int | None:
+        """Median interval of the first block, in nanoseconds; None before two rows were seen."""
+        return None if self._nominal is None else self._nominal * self._tick_ns
+
+    def feed(self, frame: pl.DataFrame, *, final: bool = False) -> pl.DataFrame:
+        """Return the rows that are settled, with ``t_ns`` (Int64, never decreasing) in the place of ``t``."""
+        if frame.height:
+            frame = frame.with_columns(t=pl.Series(self._unwrap(frame)))
+        if self._held is not None:
+            frame, self._held = pl.concat([self._held, frame], rechunk=True), None
+        ticks = frame["t"].to_numpy() + self._shift
+        if self._nominal is None and ticks.size > 1:
+            steps = np.diff(ticks)
+            steps = steps[steps > 0]
+            self._nominal = int(np.median(steps)) if steps.size else None
+        before = ticks[0] if self._last is None and ticks.size else self._last
+        steps = np.diff(ticks, prepend=before) if ticks.size else ticks
+        if steps.size and (steps[1:].min(initial=1) <= 0 or steps[0] < 0 or steps.max() > self._jump):
+            frame, ticks = self._settle(frame, ticks, steps, final)
+        elif self._last is not None and steps.size and steps[0] == 0:
+            frame, ticks = self._drop_repeats(frame, ticks)
+        if frame.height:
+            self._measure(frame, ticks)
+            self._last = int(ticks[-1])
+            self._last_row = frame.drop("t", "line").row(-1)
+        if final:
+            self._summary()
+        self._report.keep(frame.height)
+        stamp = pl.Series("t_ns", ticks * self._tick_ns, dtype=pl.Int64)
+        return frame.drop("t").insert_column(0, stamp)
+
+    @property
+    def _jump(self) -> int:
+        """Ticks above which an interval may be a damaged number instead of a gap."""
+        second = 1_000_000_000 // self._tick_ns
+        return max(second, 100 * (self._nominal or 0))
+
+    def _unwrap(self, frame: pl.DataFrame) -> Int64Array:
+        raw = frame["t"].to_numpy()
+        if self._period is None:
+            return raw
+        steps = np.diff(raw, prepend=raw[0] if self._raw is None else self._raw)
+        window = ROLLOVER_S * 1e9 / self._tick_ns
+        wraps = np.flatnonzero((steps < 0) & (steps + self._period < window))
+        self._raw = int(raw[-1])
+        out = raw + self._turns
+        for i in wraps:
+            out[i:] += self._period
+            self._turns += self._period
+            self._report.repair(
+                "counter_rollover",
+                f"{self._subject}the counter wrapped after {raw[i] - steps[i]}: {self._period} ticks added "
+                "from here on",
+                line=frame["line"][int(i)],
+                subject=self._subject,
+            )
+        return out
+
+    def _settle(
+        self, frame: pl.DataFrame, ticks: Int64Array, steps: Int64Array, final: bool
+    ) -> tuple[pl.DataFrame, Int64Array]:
+        """Go through the monotone pieces between breaks; keep, drop, move or hold each."""
+        lines = frame["line"].to_numpy()
+        keep = np.ones(ticks.size, dtype=bool)
+        breaks = np.flatnonzero((steps < 0) | (steps > self._jump))
+        starts = [0, *(int(b) for b in breaks if b > 0)]
+        ends = [*starts[1:], ticks.size]
+        ticks = ticks.copy()
+        last = self._last
+        for a, b in zip(starts, ends, strict=True):
+            upcoming = int(ticks[b]) if b < ticks.size else None
+            short = b - a < SLIP_ROWS
+            if upcoming is None and short and not final and a > 0:
+                self._held = frame[a:].with_columns(t=pl.Series(ticks[a:] - self._shift))
+                frame, ticks, keep = frame[:a], ticks[:a], keep[:a]
+                break
+            if self._stands_out(ticks[a:b], last, upcoming, short):
+                keep[a:b] = False
+                self._slip(ticks, lines, a, b, last if last is not None else upcoming)
+                continue
+            if last is not None and ticks[a] < last:
+                back = int(np.searchsorted(ticks[a:b], last))
+                if back < SLIP_ROWS:
+                    keep[a : a + back] = False
+                    self._slip(ticks, lines, a, a + back, last)
+                    if back == b - a:
+                        continue
+                else:
+                    move = last + (self._nominal or 1) - int(ticks[a])
+                    self._report.repair(
+                        "backwards_time",
+                        f"{self._subject}the clock steps back by {self._text(last - int(ticks[a]))} and goes on "
+                        f"from there: all rows from here on moved by {self._text(move)}",
+                        rows=ticks.size - a,
+                        line=lines[a],
+                        subject=self._subject + "restart",
+                    )
+                    ticks[a:] += move
+                    self._shift += move
+            last = int(ticks[b - 1])
+        frame, ticks = frame.filter(pl.Series(keep)), ticks[keep]
+        return self._drop_repeats(frame, ticks)
+
+    def _stands_out(self, piece: Int64Array, last: int | None, upcoming: int | None, short: bool) -> bool:
+        """Whether a short piece lies ahead of both of its neighbours, or does not lead to what follows."""
+        if not short or upcoming is None:
+            return False
+        if last is None:  # a first row whose time was cut, or damaged
+            return upcoming < piece[-1] or (
+                upcoming - piece[-1] > self._jump and self._is_cut(piece, upcoming)
+            )
+        return piece[0] - last > self._jump and last <= upcoming <= piece[-1]
+
+    def _is_cut(self, piece: Int64Array, upcoming: int) -> bool:
+        """Whether the only row of ``piece`` carries the last digits of the time that should stand there."""
+        nominal = self._nominal or 1
+        end = str(int(piece[0]))
+        return piece.size == 1 and any(
+            str(upcoming - d).endswith(end) for d in range(max(1, nominal // 2), 2 * nominal + 1)
+        )
+
+    def _slip(self, ticks: Int64Array, lines: Int64Array, a: int, b: int, last: int | None) -> None:
+        off = int(ticks[a]) - (last or 0)
+        self._report.drop(
+            "backwards_time",
+            f"{self._subject}time is {self._text(abs(off))} {'ahead of' if off > 0 else 'before'} its neighbours "
+            "and comes back: row dropped",
+            count=b - a,
+            line=lines[a],
+            subject=self._subject,
+        )
+
+    def _drop_repeats(self, frame: pl.DataFrame, ticks: Int64Array) -> tuple[pl.DataFrame, Int64Array]:
+        same = np.flatnonzero(
+            np.diff(ticks, prepend=ticks[:1] - 1 if self._last is None else self._last) == 0
+        )
+        if not same.size:
+            return frame, ticks
+        data = frame.drop("t", "line")
+        first = same[0] == 0  # its predecessor is in the block before
+        at = same[1:] if first else same
+        equal = np.zeros(same.size, dtype=bool)
+        if at.size:
+            pair = [data[c].gather(at).eq_missing(data[c].gather(at - 1)).to_numpy() for c in data.columns]
+            equal[1 if first else 0 :] = np.logical_and.reduce(pair) if pair else True
+        if first:
+            equal[0] = self._last_row is not None and data.row(0) == self._last_row
+        lines = frame["line"]
+        for kind, rows in (("duplicate_row", same[equal]), ("duplicate_time", same[~equal])):
+            if not rows.size:
+                continue
+            line = lines[int(rows[0])]
+            if kind == "duplicate_row":
+                text = f"{self._subject}equals the row before, time included: dropped"
+                self._report.drop(kind, text, count=rows.size, line=line, subject=self._subject)
+            else:
+                text = f"{self._subject}same time as the row before, other values: kept"
+                self._report.note(kind, text, count=rows.size, line=line, subject=self._subject)
+        keep = np.ones(ticks.size, dtype=bool)
+        keep[same[equal]] = False
+        return frame.filter(pl.Series(keep)), ticks[keep]
+
+    def _measure(self, frame: pl.DataFrame, ticks: Int64Array) -> None:
+        if not self._even or self._nominal is None:
+            return
+        steps = np.diff(ticks, prepend=ticks[:1] - self._nominal if self._last is None else self._last)
+        odd = np.flatnonzero(np.abs(steps - self._nominal) > max(1.0, JITTER * self._nominal))
+        odd = odd[steps[odd] > 0]
+        gaps = steps[odd] > GAP * self._nominal
+        for k, at in enumerate((odd[gaps], odd[~gaps])):
+            if not at.size:
+                continue
+            self._counts[k] += at.size
+            self._longest[k] = max(self._longest[k], int(steps[at].max()))
+            if self._where[k] is None:
+                self._where[k] = int(frame["line"][int(at[0])])
+
+    def _summary(self) -> None:
+        nominal = self._nominal or 1
+        for k, kind in enumerate(("gap", "jitter")):
+            if not self._counts[k]:
+                continue
+            text = (
+                f"{self._subject}intervals {'above' if k == 0 else 'off the'} nominal {self._text(nominal)}"
+                f"{'' if k == 0 else ' by more than 10 %'}, longest {self._text(self._longest[k])}: "
+                "kept as they are"
+            )
+            lost = k == 0 and self._longest[0] > LONG_GAP * nominal
+            say = self._report.loss if lost else self._report.note
+            say(kind, text, count=self._counts[k], line=self._where[k], subject=self._subject)
+
+    def _text(self, ticks: int) -> str:
+        return f"{ticks * self._tick_ns / 1e6:g} ms"

@@ -1,0 +1,157 @@
+"""Numeric text in blocks: every physical line is a row, blank, chatter or a bad row, with its number."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..recording.errors import MarchaError
+from .contract import ReportBuilder
+
+BLOCK_BYTES = 4 << 20
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The rows of one block of text.
+
+    Attributes
+    ----------
+    values : int64 array (columns, rows)
+        One line of the array a column.
+    lines : int64 array (rows,)
+        Physical line of each row, from 1.
+    wall_ms : int32 array (rows,)
+        Wall clock that a terminal put before the row, ms of the day; -1 where none.
+    """
+
+    values: NDArray[np.int64]
+    lines: NDArray[np.int64]
+    wall_ms: NDArray[np.int32]
+
+
+def read_blocks(path: Path, size: int = BLOCK_BYTES) -> Iterator[tuple[bytes, bool]]:
+    """Yield pieces of a file cut at line ends, and whether a piece is the last.
+
+    A file of lines ended by a lone CR is one piece.
+
+    Raises
+    ------
+    MarchaError
+        Where the file cannot be read.
+    """
+    try:
+        with path.open("rb") as f:
+            rest = b""
+            while data := f.read(size):
+                cut = data.rfind(b"\n") + 1
+                if not cut:
+                    rest += data
+                    continue
+                piece, rest = rest + data[:cut], data[cut:]
+                yield piece, False
+            yield rest, True
+    except OSError as error:
+        raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def integer_rows(
+    path: Path,
+    limits: Sequence[tuple[int, int]],
+    names: Sequence[str],
+    report: ReportBuilder,
+    *,
+    first_line: int = 1,
+    size: int = BLOCK_BYTES,
+) -> Iterator[Rows]:
+    """Read lines of ``len(limits)`` integers between commas, semicolons, tabs or spaces.
+
+    Lines end in LF, CRLF or CR, also mixed. A wall clock in front (``12:34:56.789``, with or without a date) is taken
+    off. Blank lines are nothing; lines of words are ``chatter``; any other line that is not a row is dropped
+    as ``bad_row`` with the reason.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    limits : sequence of (int, int)
+        Lowest and highest value of each column.
+    names : sequence of str
+        Names of the columns, for messages.
+    report : ReportBuilder
+        Takes chatter and bad rows; rows that are returned are counted by whoever keeps them.
+    first_line : int
+        Number of the first line.
+    size : int
+        Bytes of a block.
+    """
+    line = first_line
+    ended = True
+    for piece, final in read_blocks(path, size):
+        if not piece:
+            break
+        if final:
+            ended = piece[-1:] in b"\r\n"
+        rows, passed = rows_of(piece, limits, names, report, first_line=line)
+        line += passed
+        yield rows
+    if not ended:
+        report.note(
+            "no_final_newline",
+            "the last line has no line end: its last number may be cut short",
+            line=line - 1,
+        )
+
+
+def rows_of(
+    piece: bytes,
+    limits: Sequence[tuple[int, int]],
+    names: Sequence[str],
+    report: ReportBuilder,
+    *,
+    first_line: int = 1,
+) -> tuple[Rows, int]:
+    """Read one piece of text as :func:`integer_rows` does; also return its number of physical lines."""
+    from .textscan import CHATTER, scan
+
+    low = np.array([a for a, _ in limits], dtype=np.int64)
+    high = np.array([b for _, b in limits], dtype=np.int64)
+    data = np.frombuffer(piece, dtype=np.uint8)
+    room = 1 + piece.count(b"\n") + piece.count(b"\r") - piece.count(b"\r\n")
+    values = np.empty((len(low), room), dtype=np.int64)
+    lines = np.empty(room, dtype=np.int64)
+    wall = np.empty(room, dtype=np.int32)
+    odd = np.empty((room, 5), dtype=np.int64)
+    rows, n_odd, passed = scan(data, low, high, first_line, values, lines, wall, odd)
+    for number, start, end, status, column in odd[:n_odd].tolist():
+        text = _shown(piece[start:end])
+        if status == CHATTER:
+            report.note("chatter", f"{text}: not a row of numbers; skipped", line=number)
+        else:
+            reason = _reason(status, column, names, limits)
+            report.drop("bad_row", f"{text}: {reason}; row dropped", line=number)
+    return Rows(values[:, :rows], lines[:rows], wall[:rows]), passed
+
+
+def _shown(raw: bytes, width: int = 40) -> str:
+    """A line of unknown bytes as short printable text in quotes."""
+    text = raw[: width + 1].decode("ascii", "backslashreplace")
+    text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+    return f"'{text[:width]}{'…' if len(text) > width or len(raw) > width else ''}'"
+
+
+def _reason(status: int, column: int, names: Sequence[str], limits: Sequence[tuple[int, int]]) -> str:
+    from .textscan import FEW, MANY, NOT_A_NUMBER
+
+    if status == FEW:
+        return f"{column} of {len(names)} columns"
+    if status == MANY:
+        return f"more than {len(names)} columns"
+    name = f"column {column + 1} ({names[column]})"
+    if status == NOT_A_NUMBER:
+        return f"{name} is not a whole number"
+    return f"{name} is outside {limits[column][0]} … {limits[column][1]}"
