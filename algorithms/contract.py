@@ -21,7 +21,9 @@ The result
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, Protocol, Self, runtime_checkable
 
 import msgspec
@@ -172,26 +174,34 @@ class KernelEstimator(PlainEstimator):
     """Base of estimators whose state is one packed float64 buffer and whose step is a numba kernel.
 
     A subclass sets ``kernel(state, row, out) -> bool`` and ``run(state, rows, out) -> int``, both
-    module-level ``@njit(cache=True, nogil=True)`` functions of its module, and ``flush_kernel`` where
-    ``latency`` is not 0, and builds ``self.state`` in ``__init__``. ``kernel`` returns whether ``out`` was filled;
+    module-level ``@njit(cache=True, nogil=True)`` functions of its module wrapped in ``staticmethod``, and
+    ``flush_kernel(state, out) -> int`` where ``latency`` is not 0, and builds ``self.state`` in ``__init__``. ``kernel`` returns whether ``out`` was filled;
     ``run`` fills ``out[i]`` from ``rows[i]`` (a row without a result is NaN throughout) and returns the number of results.
     Both give equal bits.
     """
 
-    kernel: ClassVar[Any]
-    run: ClassVar[Any]
+    kernel: ClassVar[Callable[..., Any]]
+    run: ClassVar[Callable[..., Any]]
+    flush_kernel: ClassVar[Callable[..., Any] | None] = None
     state: FloatArray
 
     def step(self, row: FloatArray) -> FloatArray | None:
         """Take one row, return one result or None."""
         out = np.empty(self.width)
-        return out if type(self).kernel(self.state, row, out) else None
+        return out if self.kernel(self.state, row, out) else None
 
     def run_block(self, rows: FloatArray, out: FloatArray) -> int:
         """Take ``rows`` (n, inputs), fill ``out`` (n, outputs); rows without a result are NaN."""
-        return int(type(self).run(self.state, rows, out))
+        return int(self.run(self.state, rows, out))
 
-    @property
+    def flush(self) -> FloatArray:
+        """Return the results of the last ``latency`` rows, shape (≤ latency, columns)."""
+        out = np.empty((self.latency, self.width))
+        if self.flush_kernel is None or self.latency == 0:
+            return out[:0]
+        return out[: int(self.flush_kernel(self.state, out))]
+
+    @cached_property
     def width(self) -> int:
         """Number of result columns."""
         return len(output_columns(self))

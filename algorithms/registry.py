@@ -1,0 +1,113 @@
+"""Find estimators by name and build them with checked parameters."""
+
+from __future__ import annotations
+
+import warnings
+from importlib.metadata import entry_points
+from typing import Any
+
+import msgspec
+
+from .contract import AlgorithmError, PlainEstimator
+from .parameters import describe
+
+GROUP = "marcha.estimators"
+
+
+def available() -> dict[str, type[PlainEstimator]]:
+    """Return every installed estimator by name, sorted.
+
+    Built-in ones and plug-ins register alike, as entry points of the group ``marcha.estimators``. A plug-in that
+    cannot be loaded, or that is no estimator, is left out with a warning that names it.
+    """
+    found: dict[str, type[PlainEstimator]] = {}
+    for point in sorted(entry_points(group=GROUP), key=lambda p: p.name):
+        cls = _load(point)
+        if cls is not None:
+            found[point.name] = cls
+    return found
+
+
+def find(name: str) -> type[PlainEstimator]:
+    """Return the estimator class called ``name``.
+
+    Raises
+    ------
+    AlgorithmError
+        Where there is none; lists what there is.
+    """
+    points = [p for p in entry_points(group=GROUP) if p.name == name]
+    for point in points:
+        cls = _load(point)
+        if cls is not None:
+            return cls
+    if points:
+        raise AlgorithmError(
+            f"estimator {name!r} cannot be loaded (see the warning); available: {_names(available())}"
+        )
+    raise AlgorithmError(f"no estimator {name!r}; available: {_names(available())}")
+
+
+def make(name: str, /, *, preset: str | None = None, **params: Any) -> PlainEstimator:
+    """Build the estimator ``name``.
+
+    Parameters
+    ----------
+    name : str
+        ``foot.9iez`` …; see :func:`available`.
+    preset : str, optional
+        A named parameter set of the estimator; ``params`` go on top of it.
+    **params
+        Values of the estimator's own parameters; text is converted (``"0.1"`` to 0.1), as a command line needs.
+
+    Raises
+    ------
+    AlgorithmError
+        Unknown name, preset or parameter, or a value out of range: one line with the candidates.
+    """
+    cls = find(name)
+    return cls(build_params(name, cls, {**_preset(name, cls, preset), **params}))
+
+
+def build_params(name: str, cls: type[PlainEstimator], params: dict[str, Any]) -> msgspec.Struct:
+    """Return ``cls.Params`` filled with ``params``; AlgorithmError where one is unknown or out of range."""
+    fields = {p.name: p for p in describe(cls.Params)}
+    unknown = sorted(set(params) - set(fields))
+    if unknown:
+        raise AlgorithmError(f"{name} has no parameter {unknown[0]!r}; it has: {_names(fields) or 'none'}")
+    for key, value in params.items():
+        try:
+            msgspec.convert({key: value}, cls.Params, strict=False)
+        except msgspec.ValidationError as error:
+            field = fields[key]
+            allowed = ", ".join(field.choices) or f"{field.type} {field.range}".strip()
+            unit = f" ({field.unit})" if field.unit not in ("", "1") else ""
+            raise AlgorithmError(
+                f"{name}: {key} = {value!r} is not allowed; must be {allowed}{unit}"
+            ) from error
+    return msgspec.convert(params, cls.Params, strict=False)
+
+
+def _preset(name: str, cls: type[PlainEstimator], preset: str | None) -> dict[str, Any]:
+    if preset is None:
+        return {}
+    if preset not in cls.presets:
+        raise AlgorithmError(f"{name} has no preset {preset!r}; it has: {_names(cls.presets) or 'none'}")
+    return cls.presets[preset]
+
+
+def _load(point: Any) -> type[PlainEstimator] | None:
+    try:
+        cls = point.load()
+        if not (isinstance(cls, type) and callable(getattr(cls, "step", None))):
+            raise TypeError(f"{cls!r} is not a class with a method step")
+    except Exception as error:
+        warnings.warn(
+            f"estimator plug-in {point.name!r} ({point.value}) cannot be loaded: {error}", stacklevel=3
+        )
+        return None
+    return cls
+
+
+def _names(names: Any) -> str:
+    return ", ".join(sorted(names))
