@@ -1,0 +1,215 @@
+"""Which views a recording gets, and how they are arranged.
+
+The layout follows from what the scenes show (:class:`marcha.viz.scene.Entry`), so a raw recording, one run, many runs and
+several recordings side by side all get the tabs they can fill: Overview, Raw, Detector, Compare, Report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+
+import numpy as np
+import rerun.blueprint as rrb
+
+from .scene import TIMELINE, Entry, Floats, Scene
+
+TRAIL_S = 60.0
+"""Length of the trail behind the cursor where a recording is too long to show all of it."""
+
+TRAIL_ROWS = 60_000
+"""Up to this many samples the trail reaches back to the start."""
+
+SPATIAL = ("track", "trail", "foot", "mark", "footprints")
+BACKGROUND = (24, 28, 34)
+
+
+def blueprint(scenes: Sequence[Scene], *, live: bool = False) -> rrb.Blueprint:
+    """Return the blueprint of scenes that share one view.
+
+    Parameters
+    ----------
+    scenes : sequence of Scene
+        Begun (live) or drawn (saved): extents and lengths are known only then.
+    live : bool
+        Whether data still comes: the cursor follows it.
+    """
+    entries = [e for s in scenes for e in s.entries]
+    tabs = [
+        _overview(scenes, entries),
+        _raw(entries),
+        _detector(entries),
+        _compare(scenes, entries),
+        _report(entries),
+    ]
+    root = rrb.Tabs(*[t for t in tabs if t is not None], active_tab=0)
+    return rrb.Blueprint(
+        root,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(
+            state="collapsed", timeline=TIMELINE, play_state="following" if live else "paused"
+        ),
+        auto_layout=False,
+        auto_views=False,
+    )
+
+
+def _of(entries: Iterable[Entry], *roles: str) -> list[Entry]:
+    return [e for e in entries if e.role in roles]
+
+
+def _below(entries: Iterable[Entry]) -> list[str]:
+    """Return contents of a view: the entities and what lies below them."""
+    return [f"{e.path}/**" for e in entries]
+
+
+def _plot(name: str, entries: Sequence[Entry], contents: Sequence[str] = ()) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=[*(contents or _below(entries))],
+        name=name,
+        axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
+    )
+
+
+def _lanes(entries: Sequence[Entry]) -> list[rrb.StateTimelineView]:
+    found = _of(entries, "stance", "annotation")
+    if not found:
+        return []
+    name = "stance" if not _of(found, "annotation") else "stance and annotations"
+    return [
+        rrb.StateTimelineView(
+            origin="/", contents=[e.path for e in found], name=name, time_view=rrb.TimeAxis(link="LinkToGlobal")
+        )
+    ]
+
+
+def _space(
+    scenes: Sequence[Scene], entries: Sequence[Entry], name: str, *, above: bool = False
+) -> rrb.Spatial3DView:
+    """Return the 3D view of all tracks, from the side or straight from above."""
+    low, high = _extent(scenes)
+    centre, size = (low + high) / 2, max(float(np.linalg.norm((high - low)[:2])), 2.0)
+    if above:
+        eye = rrb.EyeControls3D(
+            position=centre + (0.0, -1e-3 * size, 1.25 * size), look_target=centre, eye_up=(0.0, 1.0, 0.0)
+        )
+    else:
+        eye = rrb.EyeControls3D(
+            position=centre + (-0.15 * size, -0.95 * size, 0.75 * size), look_target=centre, eye_up=(0.0, 0.0, 1.0)
+        )
+    whole = all(t.seen <= TRAIL_ROWS for s in scenes for t in s.tracks.values())
+    boundary = rrb.TimeRangeBoundary
+    trail = rrb.VisibleTimeRanges(
+        timeline=TIMELINE,
+        start=boundary.infinite() if whole else boundary.cursor_relative(seconds=-TRAIL_S),
+        end=boundary.cursor_relative(),
+    )
+    past = rrb.VisibleTimeRanges(timeline=TIMELINE, start=boundary.infinite(), end=boundary.cursor_relative())
+    return rrb.Spatial3DView(
+        origin="/",
+        contents=[e.path for e in _of(entries, *SPATIAL)],
+        name=name,
+        eye_controls=eye,
+        background=rrb.Background(kind="SolidColor", color=BACKGROUND),
+        line_grid=rrb.LineGrid3D(visible=True, spacing=1.0, color=(255, 255, 255, 24)),
+        spatial_information=rrb.SpatialInformation(target_frame="tf#/", show_axes=True),
+        overrides={
+            **{e.path: trail for e in _of(entries, "trail")},
+            **{e.path: past for e in _of(entries, "footprints")},
+        },
+    )
+
+
+def _extent(scenes: Sequence[Scene]) -> tuple[Floats, Floats]:
+    """Return the corners (3,), (3,) of all tracks as shown; a room of 10 m where nothing is known yet."""
+    shown = [p for s in scenes for p in s.extents()]
+    if not shown:
+        return np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 1.0])
+    points = np.concatenate(shown)
+    return points.min(axis=0), points.max(axis=0)
+
+
+def _overview(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Container | None:
+    plots: list[rrb.View] = []
+    if height := _of(entries, "height"):
+        plots.append(_plot("height (m)", height))
+    plots += _lanes(entries)
+    plots += [_plot(e.title, [e]) for e in _of(entries, "norm")[:2]]
+    if not _of(entries, "track", "map"):
+        return rrb.Vertical(*plots, name="Overview") if plots else None
+    left: list[rrb.View] = []
+    if _of(entries, "track"):
+        left.append(_space(scenes, entries, "track"))
+    if fixes := _of(entries, "map"):
+        left.append(rrb.MapView(origin="/", contents=[e.path for e in fixes], name="map"))
+    return rrb.Horizontal(
+        rrb.Vertical(*left), rrb.Vertical(*plots), column_shares=[3, 2], name="Overview"
+    )
+
+
+def _raw(entries: Sequence[Entry]) -> rrb.Container | None:
+    raw = _of(entries, "raw")
+    if not raw:
+        return None
+    views = [_plot(e.title, [e], [e.path]) for e in raw]
+    return rrb.Grid(*views, grid_columns=2 if len(views) > 3 else 1, name="Raw")
+
+
+def _by_owner(entries: Iterable[Entry]) -> Iterator[tuple[str, list[Entry]]]:
+    groups: dict[str, list[Entry]] = {}
+    for entry in entries:
+        groups.setdefault(entry.owner, []).append(entry)
+    yield from groups.items()
+
+
+def _detector(entries: Sequence[Entry]) -> rrb.Container | None:
+    """Return, side by side, every run's statistics against their thresholds, above all stance lanes."""
+    statistics = _of(entries, "detector")
+    if not statistics:
+        return None
+    runs = [
+        rrb.Vertical(*[_plot(e.title, [e]) for e in found], name=owner)
+        for owner, found in _by_owner(statistics)
+    ]
+    top = rrb.Horizontal(*runs) if len(runs) <= 3 else rrb.Tabs(*runs)
+    return rrb.Vertical(top, *_lanes(entries), row_shares=[3, 1], name="Detector")
+
+
+def _compare(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Container | None:
+    tracks = _of(entries, "track")
+    if not tracks:
+        return None
+    plots: list[rrb.View | rrb.Container] = []
+    if distance := _of(entries, "distance"):
+        plots.append(_plot("distance to the reference (m)", distance))
+    errors = _of(entries, "error", "sigma")
+    if errors:
+        views = [
+            _plot(f"{owner}: {'error and ' if _of(found, 'error') else ''}±1σ of the position (m)", found)
+            for owner, found in _by_owner(errors)
+        ]
+        plots.append(views[0] if len(views) == 1 else rrb.Tabs(*views))
+    if speed := _of(entries, "speed"):
+        plots.append(_plot("speed (m/s)", speed))
+    if steps := _of(entries, "step"):
+        plots.append(_plot("step length (m)", steps))
+    plots += [_plot("height (m)", h) for h in [_of(entries, "height")] if h]
+    return rrb.Horizontal(
+        _space(scenes, entries, "from above", above=True),
+        rrb.Vertical(*plots),
+        column_shares=[1, 1],
+        name="Compare",
+    )
+
+
+def _report(entries: Sequence[Entry]) -> rrb.Container:
+    document = rrb.TextDocumentView(origin="/report", contents="$origin/**", name="report")
+    events = [e.path for e in _of(entries, "log")]
+    if not events:
+        return rrb.Vertical(document, name="Report")
+    log = rrb.TextLogView(origin="/", contents=events, name="steps and annotations")
+    return rrb.Horizontal(document, log, column_shares=[3, 2], name="Report")
+
+

@@ -1,0 +1,321 @@
+"""One recording on one Rerun stream: channels become entities, logged in columns.
+
+A :class:`Scene` draws one recording (read from a file or arriving live). Each channel has an artist
+(:mod:`marcha.viz.artists`), chosen by its message type, which logs its style once, its rows in blocks, and what can only
+be drawn when all is known (the whole track) at the end.
+
+Entities, below a prefix of the recording's own where several are shown together:
+
+========================  =====================================================================
+``/<topic>/…``            raw signals: ``acc``, ``gyr``, ``acc_norm``, ``gyr_norm``, ``mag`` …
+``/run/<run>/…``          one run: ``track`` (whole), ``trail`` (one point a sample), ``foot`` (axes of the body),
+                          ``height``, ``velocity``, ``speed``, ``stance``, ``detector/<statistic>``, ``sigma/<what>``,
+                          ``step``, ``footprints``, ``error/<axis>``, ``distance``, ``mark`` (start, end, name)
+``/reference/…``          the same for the truth, where there is one
+``/annotation/<tier>``    lanes of labelled intervals
+``/log``                  steps and annotations as text
+``/report``               metrics, parameters and findings
+========================  =====================================================================
+
+The only time line is ``time``: nanoseconds since the epoch, or since the device's own zero. Estimates stand at
+the time that they speak of, not at the time when they were known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import numpy as np
+import polars as pl
+import rerun as rr
+from numpy.typing import NDArray
+
+from . import style
+from .track import Track, align
+
+if TYPE_CHECKING:
+    from .artists import Artist
+
+TIMELINE = "time"
+BLOCK_ROWS = 1000
+"""Rows a block: small enough for bounded memory, large enough for speed (measured: 2.5 million rows/s)."""
+
+FAR_M = 1e4
+"""Positions farther from zero than this are logged relative to a local origin: Rerun's 3D is float32."""
+
+Floats = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+
+class ChannelLike(Protocol):
+    """What a scene must know of a channel before its first row."""
+
+    @property
+    def topic(self) -> str:
+        """Name in the recording."""
+        ...
+
+    @property
+    def schema(self) -> str:
+        """Message type."""
+        ...
+
+    @property
+    def columns(self) -> Sequence[str]:
+        """Columns of its table without the times."""
+        ...
+
+    @property
+    def metadata(self) -> Mapping[str, str]:
+        """Metadata of the channel."""
+        ...
+
+
+@dataclass(frozen=True)
+class Clock:
+    """How recorded nanoseconds become Rerun's time line.
+
+    Attributes
+    ----------
+    kind : str
+        ``timestamp``: since the epoch; ``duration``: since a zero of its own.
+    zero_ns : int
+        Subtracted from every time (recordings of different days side by side: each from its own start).
+    """
+
+    kind: Literal["timestamp", "duration"]
+    zero_ns: int = 0
+
+    def column(self, t_ns: Times) -> rr.TimeColumn:
+        """Return the times as the column of the one time line."""
+        t = t_ns - self.zero_ns if self.zero_ns else t_ns
+        if self.kind == "timestamp":
+            return rr.TimeColumn(TIMELINE, timestamp=t.astype("datetime64[ns]"))
+        return rr.TimeColumn(TIMELINE, duration=t.astype("timedelta64[ns]"))
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An entity that a view should show.
+
+    Attributes
+    ----------
+    role : str
+        What kind of view: ``raw``, ``norm``, ``track``, ``trail``, ``foot``, ``mark``, ``footprints``, ``height``, ``velocity``,
+        ``speed``, ``stance``, ``detector``, ``sigma``, ``error``, ``distance``, ``step``, ``annotation``, ``other``.
+    owner : str
+        The sensor, run or reference that it belongs to.
+    title : str
+        Title of a view of its own, with the unit.
+    path : str
+        Entity path; what lies below it (thresholds) belongs to it.
+    """
+
+    role: str
+    owner: str
+    title: str
+    path: str
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """A detector's limit on one of its statistics, from the channel's metadata.
+
+    Attributes
+    ----------
+    statistic : str
+        The column that it limits.
+    name : str
+        What the metadata calls it, for example ``acc_norm_min``.
+    value : float
+        In the statistic's unit.
+    """
+
+    statistic: str
+    name: str
+    value: float
+
+
+class Scene:
+    """Draws one recording into a Rerun stream.
+
+    Parameters
+    ----------
+    stream : rerun.RecordingStream
+        Where to log; the caller owns it and its sinks.
+    channels : iterable of channels
+        What will come (``topic``, ``schema``, ``columns``, ``metadata``); rows of others are not drawn.
+    clock : Clock
+        Meaning of ``t_ns``.
+    prefix : str
+        Entity path before everything, for example ``/walk1`` where several recordings are shown together.
+    first_color : int
+        Number of runs drawn before in the same view, so that no two runs have one colour.
+    """
+
+    def __init__(
+        self,
+        stream: rr.RecordingStream,
+        channels: Iterable[ChannelLike],
+        clock: Clock,
+        prefix: str = "",
+        first_color: int = 0,
+    ) -> None:
+        from .artists import artist_of
+
+        self.stream, self.clock, self.prefix = stream, clock, prefix.rstrip("/")
+        self.entries: list[Entry] = []
+        self.rows = 0
+        self.tracks: dict[str, Track] = {}
+        self.first_ns: int | None = None
+        self.last_ns: int | None = None
+        self._origin: Floats | None = None
+        channels = list(channels)
+        self.runs = list(dict.fromkeys(c.topic.split("/")[2] for c in channels if is_estimate(c.topic)))
+        self.colors = {run: style.run_color(first_color + i) for i, run in enumerate(self.runs)}
+        self.thresholds = sorted(
+            {t for c in channels for t in thresholds_of(c)}, key=lambda t: (t.name, t.value)
+        )
+        self.artists: dict[str, Artist] = {c.topic: artist_of(self, c) for c in channels}
+
+    # -- what things are called and where they go
+
+    def group(self, topic: str) -> str:
+        """Return the entity path of a channel: runs below ``/run``, everything else as its topic says."""
+        return f"{self.prefix}/run/{topic[10:]}" if is_estimate(topic) else f"{self.prefix}{topic}"
+
+    def color(self, topic: str) -> str:
+        """Return the colour of a channel's owner: its run's, or the reference's."""
+        return self.colors[topic.split("/")[2]] if is_estimate(topic) else style.REFERENCE
+
+    def owner(self, topic: str) -> str:
+        """Return what a legend calls the channel's owner: the run, ``reference``, or the topic."""
+        parts = topic.split("/")
+        name = parts[2] if is_estimate(topic) else "reference" if parts[1] == "reference" else topic
+        return f"{self.prefix[1:]} {name}".strip()
+
+    def show(self, role: str, owner: str, title: str, path: str) -> None:
+        """Say that a view should show an entity."""
+        self.entries.append(Entry(role, owner, title, path))
+
+    def origin(self, first: Floats) -> Floats:
+        """Return the local origin for positions that begin at ``first`` (3,), in metres: zero unless far away."""
+        if self._origin is None:
+            self._origin = np.round(first) if np.abs(first).max() > FAR_M else np.zeros(3)
+        near = np.abs(first - self._origin).max() <= FAR_M
+        return self._origin if near else np.round(first)
+
+    # -- logging
+
+    def static(self, path: str, *archetypes: Any) -> None:
+        """Log something that holds at all times."""
+        self.stream.log(path, *archetypes, static=True)
+
+    def columns(self, path: str, t_ns: Times, columns: Iterable[Any]) -> None:
+        """Log columns of one entity."""
+        if t_ns.size:
+            self.stream.send_columns(path, [self.clock.column(t_ns)], columns)
+            self.rows += t_ns.size
+
+    def begin(self) -> None:
+        """Log what holds at all times: colours, names, axes."""
+        self.static(self.prefix or "/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        for artist in self.artists.values():
+            artist.begin()
+
+    def write(self, topic: str, table: pl.DataFrame) -> None:
+        """Draw rows of one channel (``t_ns`` and its columns)."""
+        artist = self.artists.get(topic)
+        if artist is None or table.height == 0:
+            return
+        t_ns = table["t_ns"].to_numpy()
+        low, high = int(t_ns.min()), int(t_ns.max())
+        self.first_ns = low if self.first_ns is None else min(low, self.first_ns)
+        self.last_ns = high if self.last_ns is None else max(high, self.last_ns)
+        for start in range(0, table.height, BLOCK_ROWS):
+            artist.draw(t_ns[start : start + BLOCK_ROWS], table.slice(start, BLOCK_ROWS))
+
+    def end(self) -> None:
+        """Draw what needs the whole: tracks, thresholds, errors against the reference."""
+        for artist in self.artists.values():
+            artist.end()
+        self._compare()
+
+    def _compare(self) -> None:
+        """Turn every run's track onto the reference and log its error over time."""
+        reference = next((t for g, t in self.tracks.items() if "/reference" in g and t.count > 1), None)
+        if reference is None:
+            return
+        for path, track in self.tracks.items():
+            if track is reference or "/run/" not in path:
+                continue
+            found = align(track, reference)
+            if found is None:
+                continue
+            track.rotation, track.translation = found.rotation, found.translation
+            self.static(
+                path, rr.Transform3D(translation=found.translation, mat3x3=found.rotation)
+            )
+            axes = f"{path}/error"
+            self.static(
+                axes,
+                rr.SeriesLines(
+                    names=[f"{track.owner} error {a} (m)" for a in "xyz"],
+                    colors=[style.rgb(c) for c in style.AXES],
+                    widths=[1.5] * 3,
+                ),
+            )
+            self.columns(axes, found.t_ns, rr.Scalars.columns(scalars=found.error))
+            self.show("error", track.owner, f"{track.owner}: error and ±1σ (m)", axes)
+            distance = f"{path}/distance"
+            self.static(
+                distance,
+                rr.SeriesLines(
+                    names=f"{track.owner} distance to the reference (m)", colors=style.rgb(track.color), widths=1.5
+                ),
+            )
+            self.columns(distance, found.t_ns, rr.Scalars.columns(scalars=np.linalg.norm(found.error, axis=1)))
+            self.show("distance", track.owner, "distance to the reference (m)", distance)
+
+    def extents(self) -> list[Floats]:
+        """Return the lowest and highest corner, (2, 3), of every track as shown, m."""
+        return [np.array([p.min(axis=0), p.max(axis=0)]) for t in self.tracks.values() if len(p := t.shown)]
+
+    def span(self) -> Times:
+        """Return first and last time seen, shape (2,), or nothing, shape (0,), before the first row."""
+        if self.first_ns is None or self.last_ns is None:
+            return np.empty(0, dtype=np.int64)
+        return np.array([self.first_ns, self.last_ns], dtype=np.int64)
+
+
+def is_estimate(topic: str) -> bool:
+    """Return whether a topic is a run's output, ``/estimate/<run>/<what>``."""
+    return topic.startswith("/estimate/") and topic.count("/") >= 3
+
+
+def thresholds_of(channel: ChannelLike) -> Iterator[Threshold]:
+    """Read ``threshold.<name> = value`` from a channel's metadata; the name begins with the statistic's."""
+    for key, text in channel.metadata.items():
+        name = key.removeprefix("threshold.")
+        if name == key:
+            continue
+        try:
+            value = float(text)
+        except ValueError:
+            continue  # a rule in words has no line
+        statistic = max((c for c in channel.columns if name.startswith(c)), key=len, default=name)
+        yield Threshold(statistic, name, value)
+
+
+def columns_of(table: pl.DataFrame, names: Sequence[str], factors: Sequence[float] = ()) -> Floats:
+    """Return columns as an (n, k) float64 array in the units they are shown in; null becomes NaN."""
+    out = np.empty((table.height, len(names)))
+    for i, name in enumerate(names):
+        column = table[name]
+        if column.dtype != pl.Float64:
+            column = column.cast(pl.Float64)
+        out[:, i] = column.fill_null(math.nan).to_numpy() if column.null_count() else column.to_numpy()
+    return out * np.asarray(factors) if len(factors) else out

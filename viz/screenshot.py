@@ -1,0 +1,121 @@
+"""Pictures of the viewer without a display: software Vulkan is enough."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..recording.errors import MarchaError
+from . import viewer
+
+PATIENCE_S = 60.0
+"""How long a recording may take to load."""
+
+SETTLE_S = 1.5
+"""Plots find their bounds some frames after the cursor has moved."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of the viewer, and what its views complained of.
+
+    Attributes
+    ----------
+    tab : str
+        Name of the tab that was shown.
+    png : bytes
+        The picture.
+    reports : tuple of str
+        Warnings and errors of the views; empty where all is well.
+    """
+
+    tab: str
+    png: bytes
+    reports: tuple[str, ...]
+
+
+def screenshots(
+    rrd: Path | str,
+    tabs: Sequence[str] = ("Overview",),
+    *,
+    at: float = 1.0,
+    size: tuple[int, int] = (1600, 900),
+    patience_s: float = PATIENCE_S,
+) -> list[Picture]:
+    """Open a ``.rrd`` in a viewer without a window and take a picture of each tab.
+
+    Parameters
+    ----------
+    rrd : path
+        Recording with its blueprint.
+    tabs : sequence of str
+        Names of the tabs to show, one after another.
+    at : float
+        Where the cursor stands, from 0 (start) to 1 (end).
+    size : (int, int)
+        Width and height, pixels.
+    patience_s : float
+        How long the recording may take to load.
+
+    Raises
+    ------
+    MarchaError
+        No graphics (Debian: mesa-vulkan-drivers and libvulkan1), the recording did not load, or it has no such tab.
+    """
+    import numpy as np
+    from rerun.experimental import ViewerClient
+
+    from .scene import TIMELINE
+
+    path = Path(rrd).resolve()
+    with viewer.native(headless=True, size=size) as process:
+        client = ViewerClient.connect(viewer.uri(process.port))
+        client.open(str(path))
+        state = _loaded(client, path, patience_s)
+        line = next(t for t in state.recordings[0].timelines if t.name == TIMELINE)
+        start, end = line.start or 0, line.end or 0
+        cursor = start + round((end - start) * at)
+        if line.time_type == "timestamp":
+            client.set_time(TIMELINE, timestamp=np.datetime64(cursor, "ns"), play_state="paused")
+        else:
+            client.set_time(TIMELINE, duration=np.timedelta64(cursor, "ns"), play_state="paused")
+        pictures = []
+        for tab in tabs:
+            _show_tab(client, tab, path)
+            time.sleep(SETTLE_S)
+            png = client.take_screenshot()
+            reports = tuple(
+                f"{v.name}: {r.severity}: {r.summary}" for v in client.get_state().views for r in v.reports
+            )
+            pictures.append(Picture(tab, png, reports))
+        return pictures
+
+
+def _loaded(client: Any, path: Path, patience_s: float) -> Any:
+    """Return the viewer's state once everything has been read."""
+    until = time.monotonic() + patience_s
+    while time.monotonic() < until:
+        state = client.get_state()
+        if state.recordings and state.recordings[0].timelines and not state.loading:
+            return state
+        time.sleep(0.05)
+    raise MarchaError(f"{path}: the viewer had not loaded it after {patience_s:g} s")
+
+
+def _show_tab(client: Any, name: str, path: Path) -> None:
+    """Bring a tab of the outermost container to the front, and hide the viewer's own menu."""
+    layout = client.get_blueprint(of="recording").blueprint
+    containers = {k: v["ContainerBlueprint"] for k, v in layout.items() if "ContainerBlueprint" in v}
+    found = next((k for k, c in containers.items() if c.get("display_name") == name), None)
+    if found is None:
+        names = sorted({c["display_name"] for c in containers.values() if "display_name" in c})
+        raise MarchaError(f"{path}: no tab {name!r}; it has {', '.join(names)}")
+    for key, container in containers.items():
+        contents = container.get("contents", [])
+        if container["container_kind"] == "Tabs" and found.lstrip("/") in contents:
+            layout[key]["ContainerBlueprint"]["active_tab"] = found.lstrip("/")
+    layout["/top_panel"] = {"PanelBlueprint": {"state": "Hidden"}}
+    client.set_blueprint(layout, of="recording")
