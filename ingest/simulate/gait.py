@@ -1,15 +1,17 @@
 """A foot that walks: an analytic trajectory whose ideal sensor readings are exact.
 
-Every coordinate of the gait is a sum of smooth steps of time (degree 7, three continuous derivatives), so position,
-velocity, acceleration, attitude, angular rate and angular acceleration all follow in closed form, at any instant,
-without integration or differences.
+Every coordinate of the gait is a sum of smooth steps of time (degree 7, three continuous derivatives), so
+position, velocity, acceleration, attitude, angular rate and angular acceleration all follow in closed form,
+at any instant, without integration or differences.
 
 Frames
-    n: level, z up, x along the first stride, origin under the box at the start. f: the foot, x forward, y left, z up
-    while the foot is flat. b: a sensor in the box, turned and shifted against f by a :class:`Mount`.
+    n: level, z up, x along the first stride, origin at the box at the start. f: the foot, x forward, y
+    left, z up while the foot is flat. b: a sensor in the box, turned and shifted against f by a
+    :class:`Mount`.
 Phases of a stride
-    heel-off (the foot rolls about the ball), swing (the ball leaves the ground, the heel arrives), slap (the foot rolls
-    down about the heel), flat (the foot stands; velocity exactly zero unless ``stance_roll_deg`` is set).
+    heel-off (the foot rolls about the ball), swing (the ball leaves the ground, the heel arrives), slap
+    (the foot rolls down about the heel), flat (the foot stands; velocity exactly zero unless
+    ``stance_roll_deg`` is set).
 """
 
 from __future__ import annotations
@@ -22,6 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+_Jet = FloatArray
+"""A quantity with its first and second derivative by time: leading axis 3."""
 
 BALL = np.array([0.12, 0.0, -0.08])
 """Ball of the foot against the box on the instep, in f (m): the foot rolls about it at heel-off."""
@@ -46,10 +50,12 @@ class Style(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     clearance_m : float
         Rise of the pivot in mid-swing (m).
     stance_roll_deg : float
-        Slow forward roll about the ball while the foot stands (deg); real feet do about 5. The truth still calls these
-        samples ``still``: it is what a zero-velocity filter takes them for. Default 0: velocity is exactly zero.
+        Slow forward roll about the ball while the foot stands (deg); real feet do about 5. The truth still
+        calls these samples ``still``: it is what a zero-velocity filter takes them for. Default 0: velocity
+        is exactly zero.
     strike_mm, strike_hz, strike_s : float
-        Heel-strike transient: a burst of vertical vibration of this amplitude, frequency and length. Default amplitude 0.
+        Heel-strike transient: a burst of vertical vibration of this amplitude, frequency and length.
+        Default amplitude 0.
     """
 
     heel_toe_roll: bool = True
@@ -164,19 +170,19 @@ class Gait:
             still=still,
         )
 
-    def _foot(self, t: FloatArray, lever: FloatArray):  # noqa: ANN202 - private bundle of arrays
-        """Return still, (yaw, pitch, roll), pivot in n and arm from pivot to sensor in f, each with two derivatives."""
+    def _foot(
+        self, t: FloatArray, lever: FloatArray
+    ) -> tuple[NDArray[np.bool_], tuple[_Jet, _Jet, _Jet], _Jet, _Jet]:
+        """Return still, angles (yaw, pitch, roll), pivot in n, arm from pivot to sensor in f.
+
+        Each but the first with two derivatives by time.
+        """
         style, n = self.style, len(t)
         if not len(self.durations):
-            zero = (np.zeros(n),) * 3
-            flat = tuple(np.zeros((n, 3)) for _ in range(2))
-            yaw = (np.full(n, self.footfalls[0, 3]), zero[1], zero[2])
-            return (
-                np.ones(n, bool),
-                (yaw, zero, zero),
-                (flat[0] + self.footfalls[0, :3], *flat),
-                (flat[0] + lever, *flat),
-            )
+            yaw, zero = np.zeros((2, 3, n))
+            pivot, arm = np.zeros((2, 3, n, 3))
+            yaw[0], pivot[0], arm[0] = self.footfalls[0, 3], self.footfalls[0, :3], lever
+            return np.ones(n, bool), (yaw, zero, zero), pivot, arm
         i = np.clip(np.searchsorted(self.lift_s, t, side="right") - 1, 0, len(self.durations) - 1)
         length = self.durations[i]
         u = np.maximum((t - self.lift_s[i]) / length, 0.0)
@@ -184,7 +190,7 @@ class Gait:
         air, strike = off, off + swing
         here, there = self.footfalls[i], self.footfalls[i + 1]
 
-        def step(start: float, end: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        def step(start: float, end: float) -> _Jet:
             """Smooth step from 0 to 1 between two phases of the stride, with its time derivatives."""
             return _smooth_step((u - start) / (end - start), (end - start) * length)
 
@@ -209,64 +215,61 @@ class Gait:
         roll = np.radians(style.roll_deg)
         phi = _combine(np.zeros(n), [(roll, rise), (-roll, fall)])
 
-        # The pivot goes from the ball of the old footfall to the heel of the new one, and wanders from ball to heel in
-        # the foot. While the foot stands it may be either; the slow roll of stance is about the ball.
+        # The pivot goes from the ball of the old footfall to the heel of the new one, and wanders from ball
+        # to heel in the foot. While the foot stands it may be either; the slow roll of stance is about the
+        # ball.
         ball, heel = (BALL, HEEL) if style.heel_toe_roll else (np.zeros(3), np.zeros(3))
         standing = u >= moving
-        wander = step(air, strike)
-        wander = tuple(np.where(standing, 0.0, w) for w in wander)
+        wander = np.where(standing, 0.0, step(air, strike))
         begin = here[:, :3] + _turn(here[:, 3], ball)
         finish = there[:, :3] + _turn(there[:, 3], heel)
         travel = finish - begin
         climb = there[:, 2] - here[:, 2]
         early, late = step(air, air + 0.75 * swing), step(air + 0.25 * swing, strike)
-        level = tuple(np.where(climb > 0, e, l) for e, l in zip(early, late, strict=True))
+        level = np.where(climb > 0, early, late)
         shake = self._strike(u, strike, length)
-        pivot = []
-        for order in range(3):
-            p = travel * span[order][:, None]
-            p[:, 2] = climb * level[order] + style.clearance_m * (rise[order] - fall[order]) + shake[order]
-            pivot.append(p)
+        pivot = span[:, :, None] * travel
+        pivot[:, :, 2] = climb * level + style.clearance_m * (rise - fall) + shake
         pivot[0] += begin
         # Not by the sum above but to the bit: a standing foot stands on its footfall.
         pivot[0][standing] = (there[:, :3] + _turn(there[:, 3], ball))[standing]
-        arm = [(w[:, None] * (ball - heel)) for w in wander]
+        arm = wander[:, :, None] * (ball - heel)
         arm[0] += lever - ball
-        return (u == 0) | standing, (psi, theta, phi), tuple(pivot), tuple(arm)
+        return (u == 0) | standing, (psi, theta, phi), pivot, arm
 
-    def _strike(
-        self, u: FloatArray, strike: float, length: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _strike(self, u: FloatArray, strike: float, length: FloatArray) -> _Jet:
         """Return the heel-strike vibration (m) and its derivatives: a sine under a bump of degree 6."""
         style = self.style
         if not style.strike_mm:
-            return (np.zeros(len(u)),) * 3
+            return np.zeros((3, len(u)))
         d, w = style.strike_s, 2 * np.pi * style.strike_hz
-        tau = u * length - np.minimum(
-            strike * length, self._moving * length - d
-        )  # over before the foot stands
+        start = np.minimum(strike * length, self._moving * length - d)  # it is over before the foot stands
+        tau = u * length - start
         x = np.clip(tau / d, 0.0, 1.0)
         b = 64 * x**3 * (1 - x) ** 3
         b1 = 192 * x**2 * (1 - x) ** 2 * (1 - 2 * x) / d
         b2 = 384 * x * (1 - x) * (1 - 5 * x + 5 * x * x) / d**2
         s, c = np.sin(w * tau), np.cos(w * tau)
         size = style.strike_mm * 1e-3
-        return size * b * s, size * (b1 * s + b * w * c), size * (b2 * s + 2 * b1 * w * c - b * w * w * s)
+        return size * np.stack((b * s, b1 * s + b * w * c, b2 * s + 2 * b1 * w * c - b * w * w * s))
 
 
-def _smooth_step(x: FloatArray, scale: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _smooth_step(x: FloatArray, scale: FloatArray) -> _Jet:
     """Return 35x⁴ − 84x⁵ + 70x⁶ − 20x⁷, held outside 0…1, and its first two derivatives by ``x * scale``."""
     x = np.clip(x, 0.0, 1.0)
     y = 1.0 - x
     x2, y2 = x * x, y * y
     value = x2 * x2 * (35.0 + x * (-84.0 + x * (70.0 - 20.0 * x)))
-    return value, 140.0 * x2 * x * y2 * y / scale, 420.0 * x2 * y2 * (y - x) / scale**2
+    return np.stack((value, 140.0 * x2 * x * y2 * y / scale, 420.0 * x2 * y2 * (y - x) / scale**2))
 
 
-def _combine(start: FloatArray, terms: list) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _combine(start: FloatArray, terms: list[tuple[FloatArray | float, _Jet]]) -> _Jet:
     """Return start + Σ weight · step, with derivatives."""
-    value, first, second = (sum(w * s[k] for w, s in terms) for k in range(3))
-    return start + value, first, second
+    out = np.zeros((3, len(start)))
+    out[0] = start
+    for weight, step in terms:
+        out += weight * step
+    return out
 
 
 def _turn(heading: FloatArray, v: FloatArray) -> FloatArray:
@@ -285,7 +288,7 @@ def _rotation(phi: FloatArray, theta: FloatArray, psi: FloatArray) -> FloatArray
     return rot
 
 
-def _attitude(yaw, pitch, roll) -> tuple[FloatArray, FloatArray, FloatArray]:  # noqa: ANN001 - triples of arrays
+def _attitude(yaw: _Jet, pitch: _Jet, roll: _Jet) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return rot_nf, angular rate (rad/s) and angular acceleration (rad/s²) in f from z-y-x angles."""
     psi, psi1, psi2 = yaw
     theta, theta1, theta2 = pitch
@@ -311,10 +314,9 @@ def _attitude(yaw, pitch, roll) -> tuple[FloatArray, FloatArray, FloatArray]:  #
     return _rotation(phi, theta, psi), omega, alpha
 
 
-def _quaternion(phi, theta, psi) -> FloatArray:  # noqa: ANN001 - floats or arrays
+def _quaternion(phi: FloatArray, theta: FloatArray, psi: FloatArray) -> FloatArray:
     """Return the unit quaternion (w, x, y, z) of Rz(psi) Ry(theta) Rx(phi), last axis 4."""
-    cf, sf, ct, st = np.cos(phi / 2), np.sin(phi / 2), np.cos(theta / 2), np.sin(theta / 2)
-    cp, sp = np.cos(psi / 2), np.sin(psi / 2)
+    (cf, ct, cp), (sf, st, sp) = ([f(a / 2) for a in (phi, theta, psi)] for f in (np.cos, np.sin))
     return np.stack(
         (
             cf * ct * cp + sf * st * sp,

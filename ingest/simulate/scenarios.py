@@ -64,9 +64,10 @@ def _laps(options: Options, strides_per_lap: int) -> int:
 
 
 def _polyline(legs: list[tuple[float, float, int, float]], vary: _Vary) -> FloatArray:
-    """Return the footfalls along ``legs`` (heading rad, length m, strides, climb m), with a footfall on every corner.
+    """Return the footfalls along ``legs`` (heading rad, length m, strides, climb m).
 
-    The foot turns half of a corner in the swing to it, half in the swing away from it.
+    Every corner has a footfall: the foot turns half of a corner in the swing to it, half in the swing
+    away from it.
     """
     headings = np.concatenate([np.full(n, h) for h, _, n, _ in legs])
     lengths = np.concatenate([d * vary.shares(n) for _, d, n, _ in legs])
@@ -116,7 +117,7 @@ def _figure_eight(options: Options, vary: _Vary) -> FloatArray:
 
 
 def _stairs(options: Options, vary: _Vary) -> FloatArray:
-    """Flights that the foot climbs two steps at a stride; ``up-down`` turns right on a landing and comes back beside."""
+    """Flights that the foot climbs two steps at a stride; ``up-down`` comes back on a flight beside."""
     count = max(1, -(-options.stair_steps // 2))
     run, climb = options.stair_steps * options.tread_m, options.stair_steps * options.riser_m
     if options.direction != "up-down":

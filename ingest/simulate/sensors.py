@@ -19,8 +19,8 @@ STANDARD_GRAVITY = 9.80665
 class ImuErrors(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Errors of one accelerometer and gyroscope; a field set to 0 (or False) switches that error off.
 
-    A reading is ``(1 + scale) · (I + [misalignment]×) · truth + bias(t) + noise``, then rounded to counts of the 16-bit
-    converter and clipped at its full scale.
+    A reading is ``(1 + scale) · (I + [misalignment]×) · truth + bias(t) + noise``, then rounded to counts
+    of the 16-bit converter and clipped at its full scale.
 
     Attributes
     ----------
@@ -31,8 +31,8 @@ class ImuErrors(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     acc_bias_walk, gyr_bias_walk : float
         Random walk of the bias (m/s²/√s, rad/s/√s).
     acc_noise, gyr_noise : float
-        White noise density (m/s²/√Hz, rad/s/√Hz); a sample has density · √rate. Defaults: rest noise of the device's
-        recordings at 100 Hz (0.035 m/s², 0.15 °/s).
+        White noise density (m/s²/√Hz, rad/s/√Hz); a sample has density · √rate. Defaults: rest noise of the
+        device's recordings at 100 Hz (0.035 m/s², 0.15 °/s).
     acc_scale, gyr_scale : tuple of float
         Relative scale error per axis.
     acc_misalignment, gyr_misalignment : tuple of float
@@ -40,7 +40,8 @@ class ImuErrors(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     quantize : bool
         Round to the converter's counts.
     clip : bool
-        Clip at the full scale. Text and packets hold 16 bits and clip in any case; :meth:`Walk.measured` need not.
+        Clip at the full scale. Text and packets hold 16 bits and clip in any case; :meth:`Walk.measured`
+        need not.
     """
 
     acc_bias: Vector = (0.0, 0.0, 0.0)

@@ -28,15 +28,17 @@ _Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Everything that can be chosen about a simulated recording, beside scenario and seed.
 
-    Fields of ``style`` may be given directly (``stance_roll_deg=5``); fields of :class:`ImuErrors` too: they hold for both
-    sensors (``gyr_noise=0``) or, with a dot, for one (``imu1.gyr_noise=0``, ``mount2.pitch_deg=20``).
+    Fields of ``style`` may be given directly (``stance_roll_deg=5``); fields of :class:`ImuErrors` too:
+    they hold for both sensors (``gyr_noise=0``) or, with a dot, for one (``imu1.gyr_noise=0``,
+    ``mount2.pitch_deg=20``).
 
     Attributes
     ----------
     laps : int or None
         Rounds of the route (default 1); or give ``duration_s``.
     duration_s : float or None
-        Least length of the recording (s): as many whole rounds as fill it. For ``still`` the length (default 30).
+        Least length of the recording (s): as many whole rounds as fill it. For ``still`` the length
+        (default 30).
     length_m : float or None
         Length of one round (m), footfall to footfall; default by scenario.
     aspect : float
@@ -133,12 +135,13 @@ def make_options(scenario: str, given: dict[str, Any]) -> Options:
         raise UsageError(f"scenario {scenario!r} is unknown: choose one of {', '.join(SCENARIOS)}")
     flat: dict[str, Any] = {}
     parts: dict[str, dict[str, Any]] = {"style": {}, "imu1": {}, "imu2": {}, "mount1": {}, "mount2": {}}
-    for name, value in given.items():
+    for name, raw in given.items():
         head, _, tail = name.partition(".")
+        value = _plain(raw)
         if tail and head in parts:
             parts[head][tail] = value
         elif name in parts:
-            parts[name].update(msgspec.to_builtins(value) if isinstance(value, msgspec.Struct) else value)
+            parts[name].update(value)
         elif name in Style.__struct_fields__:
             parts["style"][name] = value
         elif name in ImuErrors.__struct_fields__:
@@ -152,7 +155,6 @@ def make_options(scenario: str, given: dict[str, Any]) -> Options:
         for name, values in parts.items():
             if values:
                 old = options.imu(int(name[-1])) if name.startswith("imu") else getattr(options, name)
-                values = {k: _numbers(v) if isinstance(v, str) else v for k, v in values.items()}
                 changed[name] = msgspec.convert(msgspec.to_builtins(old) | values, type(old), strict=False)
     except msgspec.ValidationError as error:
         raise UsageError(f"simulate {scenario}: {error}") from error
@@ -161,9 +163,11 @@ def make_options(scenario: str, given: dict[str, Any]) -> Options:
     return msgspec.structs.replace(options, **changed)
 
 
-def _numbers(text: str) -> Any:
-    """Return "0.1,0,0" as a list; other text as it is."""
-    return text.split(",") if "," in text else text
+def _plain(value: Any) -> Any:
+    """Return a structure or NumPy value as built-in types, and "0.1,0,0" as a list."""
+    if isinstance(value, str):
+        return value.split(",") if "," in value else value
+    return msgspec.to_builtins(value, enc_hook=lambda v: v.tolist())
 
 
 @dataclass(frozen=True)
@@ -185,7 +189,8 @@ class Walk:
     still : ndarray
         Whether the foot stands, bool.
     steps : polars.DataFrame
-        One row a swing: ``start_ns``, ``end_ns``, ``index``, ``length_m`` (horizontal), ``height_m``, ``heading_rad``.
+        One row a swing: ``start_ns``, ``end_ns``, ``index``, ``length_m`` (horizontal), ``height_m``,
+        ``heading_rad``.
     closed : bool
         Whether the walk ends where it began.
     length_m : float
@@ -213,7 +218,8 @@ class Walk:
     def measured(self, errors: ImuErrors | None = None) -> tuple[FloatArray, FloatArray]:
         """Return what the sensor reports: acceleration (m/s²) and angular rate (rad/s), each (n, 3).
 
-        Without ``errors`` those of the options: the values that :func:`marcha.ingest.simulate.simulate` writes.
+        Without ``errors`` those of the options: the values that :func:`marcha.ingest.simulate.simulate`
+        writes.
         """
         imu = self.simulation.imu(self.sensor, errors)
         parts = [
@@ -297,7 +303,8 @@ class Simulation:
         """Return sensor 1 or 2, at its first sample."""
         o = self.options
         rng = self._rng(f"imu{sensor}")
-        return Imu(errors or o.imu(sensor), o.rate_hz, *o.full_scale(sensor), rng)
+        acc_lsb, gyr_lsb = o.full_scale(sensor)
+        return Imu(errors or o.imu(sensor), o.rate_hz, acc_lsb, gyr_lsb, rng)
 
     def line_rng(self) -> np.random.Generator:
         """Return the random numbers of the serial line: lost and doubled rows."""

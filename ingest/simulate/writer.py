@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, Any, Literal
@@ -103,9 +103,10 @@ def simulate(
 ) -> Simulated:
     """Write the raw log of a simulated walk and its truth.
 
-    Files: ``conf-<config>-<name>.csv`` (or ``.bin``), ``….truth.csv`` (pose of sensor 1: ``t_ns`` of the device clock
-    without roll-over, ``pos_*`` m, ``quat_*`` rot_nb, ``vel_*`` m/s, ``still``), ``….truth.imu2.csv`` (the same of
-    sensor 2) and ``….truth.toml`` (closed, length_m, scenario, seed, every parameter, the biases that were drawn).
+    Files: ``conf-<config>-<name>.csv`` (or ``.bin``), ``….truth.csv`` (pose of sensor 1: ``t_ns`` of the
+    device clock without roll-over, ``pos_*`` m, ``quat_*`` rot_nb, ``vel_*`` m/s, ``still``),
+    ``….truth.imu2.csv`` (the same of sensor 2) and ``….truth.toml`` (closed, length_m, scenario, seed,
+    every parameter, the biases that were drawn).
 
     Parameters
     ----------
@@ -238,7 +239,9 @@ class _Text:
         file.write(self._held)
 
 
-def _packets(stamp: NDArray[np.int64], quats: list, counts: list) -> np.ndarray:
+def _packets(
+    stamp: NDArray[np.int64], quats: Sequence[np.ndarray], counts: Sequence[np.ndarray]
+) -> np.ndarray:
     """Return packets of both sensors in turn, (n, 2)."""
     out = np.zeros((len(stamp), 2), PACKET)
     out["start"], out["end"] = b"$", b"\r\n"
@@ -272,8 +275,8 @@ def _facts(simulation: Simulation, line: Line, format: str) -> dict[str, Any]:
         "scenario": simulation.scenario,
         "seed": simulation.seed,
         "format": format,
-        "frame": "pose of sensor 1 (truth.csv) and 2 (truth.imu2.csv) in a level frame: z up, x along the first stride,"
-        " origin at the start of sensor 1; quat is rot_nb",
+        "frame": "pose of sensor 1 (truth.csv) and 2 (truth.imu2.csv), quat = rot_nb, in a level frame:"
+        " z up, x along the first stride, origin at the start of sensor 1",
         "options": {
             k: v
             for k, v in msgspec.to_builtins(o).items()
@@ -285,7 +288,7 @@ def _facts(simulation: Simulation, line: Line, format: str) -> dict[str, Any]:
 
 
 @contextmanager
-def _outputs(paths: list[Path], overwrite: bool) -> Iterator[list[IO[bytes]]]:
+def _outputs(paths: list[Path], overwrite: bool) -> Iterator[Sequence[IO[bytes]]]:
     """Open files under temporary names; all get their names when the block ends well, none otherwise."""
     for path in paths:
         if path.exists() and not overwrite:
