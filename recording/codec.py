@@ -1,0 +1,637 @@
+"""Tables to messages and back: the schema's columns bound to the byte layout of a channel's messages."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from .cdr import Bytes, CdrError, Layout, decode_text, layout_of_lengths, layout_of_message, split_index
+from .definitions import Library, load
+from .errors import MarchaError, UsageError
+from .schemas import TECHNOLOGIES, Group, Schema
+
+PREFIX = np.dtype(
+    [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
+)
+"""What stands before the message in an MCAP message record: 31 bytes."""
+
+SECOND = 1_000_000_000
+MAX_TIME_NS = 2**31 * SECOND - 1
+"""The last moment that ``builtin_interfaces/Time`` can hold."""
+
+_EXPAND = 64
+"""Longest fixed array of a foreign message that becomes one column an element."""
+
+
+class Binding(NamedTuple):
+    """One column and the message field behind it."""
+
+    column: str
+    kind: str
+    path: str
+
+
+# ------------------------------------------------------------------------------------------------ tables to messages
+
+
+def resolve_columns(schema: Schema, columns: Sequence[str], topic: str) -> tuple[tuple[str, ...], list[Group]]:
+    """Check the columns of a table against a schema.
+
+    Returns
+    -------
+    names : tuple of str
+        Joint (value, marker) names of a named schema, else empty.
+    groups : list of Group
+        Groups that are there.
+
+    Raises
+    ------
+    MarchaError
+        A column is unknown, or one that must be there is not.
+    """
+    given = set(columns)
+    names = _names_of(schema, columns) if schema.names else ()
+    if schema.names and not names:
+        raise MarchaError(f"{topic}: {schema.name} needs one column a name, got none")
+    groups: list[Group] = []
+    known: set[str] = set()
+    for group in schema.groups:
+        wanted = [n + c.name for c in group.columns for n in names] if schema.names else [c.name for c in group.columns]
+        here = given.intersection(wanted)
+        known.update(wanted)
+        if not here and group.optional:
+            continue
+        missing = [w for w in wanted if w not in given]
+        if missing:
+            raise MarchaError(f"{topic}: {schema.name} lacks the column {', '.join(missing)}; give it, or NaN in it")
+        groups.append(group)
+    unknown = [c for c in columns if c not in known]
+    if unknown:
+        raise MarchaError(
+            f"{topic}: {schema.name} has no column {', '.join(map(repr, unknown))}; it has "
+            + ", ".join(c.name or "<name>" for c in schema.columns)
+        )
+    if not groups:
+        raise MarchaError(f"{topic}: {schema.name} without any of its columns")
+    return names, groups
+
+
+def _names_of(schema: Schema, columns: Sequence[str]) -> tuple[str, ...]:
+    suffixes = [c.name for c in schema.columns]
+    first = suffixes[0]
+    if first:
+        return tuple(c[: -len(first)] for c in columns if c.endswith(first))
+    here = set(columns)
+    return tuple(c for c in columns if not any(s and c.endswith(s) and c[: -len(s)] in here for s in suffixes))
+
+
+class Encoder:
+    """Encodes tables of one channel as MCAP message records.
+
+    Parameters
+    ----------
+    schema : Schema
+        Message type.
+    columns : sequence of str
+        Columns of the channel's tables (without ``t_ns`` and ``t_log_ns``).
+    frame_id : str
+        Constant frame id.
+    topic : str
+        For error messages.
+    channel_id : int
+        Id that goes into the records.
+    """
+
+    def __init__(self, schema: Schema, columns: Sequence[str], frame_id: str, topic: str, channel_id: int) -> None:
+        self.schema = schema
+        self.topic = topic
+        self.channel_id = channel_id
+        self.frame_id = frame_id
+        names, groups = resolve_columns(schema, columns, topic)
+        self.library: Library = load(schema.name)
+        self.definition = next(iter(self.library.values()))
+        self._root = f"{schema.explode}[0]." if schema.explode else ""
+        self.bindings = [
+            Binding(n + c.name, c.kind, self._root + c.field.replace("[i]", f"[{i}]"))
+            for g in groups
+            for c in g.columns
+            for i, n in (enumerate(names) if schema.names else [(0, "")])
+        ]
+        by_name = {b.column: b for b in self.bindings}
+        self.bindings = [by_name[c] for c in columns]
+        self._counts = {schema.explode: 1} if schema.explode else {}
+        self._texts: dict[str, bytes] = {}
+        if schema.frame:
+            self._texts[schema.frame] = _text(frame_id, f"{topic}: frame_id")
+        if schema.names:
+            sequences = {c.field.split("[")[0] for g in groups for c in g.columns}
+            self._counts |= dict.fromkeys([schema.names, *sequences], len(names))
+            self._texts |= {f"{schema.names}[{i}]": _text(n, f"{topic}: column") for i, n in enumerate(names)}
+        self._constants: dict[str, float] = {}
+        for group in schema.groups:
+            constants = group.present if group in groups else group.absent
+            self._constants |= {self._root + k: v for k, v in constants.items()}
+        self._text_bindings = [b for b in self.bindings if b.kind == "text"]
+        self._cache: dict[tuple[bytes, ...], tuple[np.dtype[Any], Bytes]] = {}
+        self.record_size = self._plan(tuple(b"" for _ in self._text_bindings))[1].size
+
+    def _plan(self, texts: tuple[bytes, ...]) -> tuple[np.dtype[Any], Bytes]:
+        """Return the record type and the template record for given values of the text columns."""
+        if texts in self._cache:
+            return self._cache[texts]
+        strings = self._texts | {b.path: t for b, t in zip(self._text_bindings, texts, strict=True)}
+        lengths = {k: len(v) for k, v in strings.items()} | self._counts
+        layout = layout_of_lengths(self.definition, self.library, lengths)
+        dtype = record_dtype(layout)
+        record = np.zeros((), dtype)
+        message = layout.template()
+        for path, value in strings.items():
+            message[path] = value
+        record = np.concatenate([np.zeros(PREFIX.itemsize, "u1"), np.frombuffer(message.tobytes(), "u1")])
+        view = record.view(dtype)
+        view["opcode"] = 5
+        view["length"] = record.size - 9
+        view["channel"] = self.channel_id
+        for path, value in self._constants.items():
+            _set(view, path, value)
+        self._cache[texts] = dtype, record
+        return dtype, record
+
+    def encode(
+        self, columns: Mapping[str, NDArray[Any]], t_ns: NDArray[np.int64], t_log_ns: NDArray[np.int64], sequence: int
+    ) -> tuple[Bytes, NDArray[np.int64]]:
+        """Lay a block of rows into message records.
+
+        Parameters
+        ----------
+        columns : mapping
+            Column name to array, all of one length, as :meth:`arrays` returns them.
+        t_ns, t_log_ns : ndarray of int64, shape (n,)
+            Time that the message speaks of, and when it was known.
+        sequence : int
+            Sequence number of the first row.
+
+        Returns
+        -------
+        data : ndarray of uint8
+            The records, one behind the other.
+        offsets : ndarray of int64, shape (n,)
+            Where each record starts in ``data``.
+        """
+        n = len(t_ns)
+        if not self._text_bindings:
+            data = self._encode((), columns, t_ns, t_log_ns, np.arange(sequence, sequence + n))
+            return data.reshape(-1), np.arange(n, dtype=np.int64) * data.shape[1]
+        texts = list(zip(*(columns[b.column] for b in self._text_bindings), strict=True))
+        records: list[bytes] = [b""] * n
+        numbers = np.arange(sequence, sequence + n)
+        rows_of: dict[tuple[bytes, ...], list[int]] = {}
+        for i, text in enumerate(texts):
+            rows_of.setdefault(text, []).append(i)
+        for text, rows in rows_of.items():
+            part = {k: v[rows] for k, v in columns.items()}
+            for i, row in zip(rows, self._encode(text, part, t_ns[rows], t_log_ns[rows], numbers[rows]), strict=True):
+                records[i] = row.tobytes()
+        sizes = np.fromiter(map(len, records), np.int64, n)
+        return np.frombuffer(b"".join(records), "u1"), np.cumsum(sizes) - sizes
+
+    def _encode(
+        self,
+        texts: tuple[bytes, ...],
+        columns: Mapping[str, NDArray[Any]],
+        t_ns: NDArray[np.int64],
+        t_log_ns: NDArray[np.int64],
+        sequence: NDArray[np.int64],
+    ) -> Bytes:
+        dtype, template = self._plan(texts)
+        data = np.empty((len(t_ns), template.size), "u1")
+        data[:] = template
+        records = data.view(dtype)[:, 0]
+        records["sequence"] = sequence & 0xFFFFFFFF
+        records["log"] = t_log_ns
+        records["publish"] = t_ns
+        _set_time(records, self._root + self.schema.stamp, t_ns)
+        for column, kind, path in self.bindings:
+            if kind == "text":
+                continue
+            values = columns[column]
+            if kind == "time":
+                _set_time(records, path, values)
+            else:
+                _set(records, path, values)
+        return data
+
+    def arrays(self, table: pl.DataFrame) -> dict[str, NDArray[Any]]:
+        """Check and convert the columns of a table to what :meth:`encode` takes.
+
+        Raises
+        ------
+        MarchaError
+            A column is of the wrong type, has nulls where there is no NaN, or is out of the field's range.
+        """
+        dtype, _ = self._plan(tuple(b"" for _ in self._text_bindings))
+        return {b.column: self._array(table[b.column], b, dtype) for b in self.bindings}
+
+    def _array(self, series: pl.Series, binding: Binding, dtype: np.dtype[Any]) -> NDArray[Any]:
+        where = f"{self.topic}: column {binding.column!r}"
+        kind, of = binding.kind, series.dtype
+        if kind == "flag":
+            _refuse(where, of, of == pl.Boolean or of.is_integer(), "Boolean")
+        elif kind in ("mac", "technology", "text"):
+            _refuse(where, of, of in (pl.String, pl.Categorical, pl.Enum), "String")
+        elif kind == "time":
+            _refuse(where, of, of == pl.Int64, "Int64 nanoseconds")
+        else:
+            _refuse(where, of, of.is_numeric(), "a number")
+        if kind in ("number", "sigma"):
+            field = _field_type(dtype, binding.path)
+            if field.kind == "f":
+                values = series.cast(pl.Float64).to_numpy()
+                return np.square(values) if kind == "sigma" else values
+            _refuse(where, of, of.is_integer(), "an integer")
+        if series.null_count():
+            raise MarchaError(f"{where}: {series.null_count()} nulls, and {of} has no NaN; drop or fill these rows")
+        if kind == "number":
+            return _integers(series.to_numpy(), _field_type(dtype, binding.path), where)
+        if kind == "flag":
+            return _flags(series, where)
+        if kind == "time":
+            return check_times(series.to_numpy(), where)
+        text = series.cast(pl.String)
+        if kind == "text":
+            return np.array([_text(v, where) for v in text.to_list()], object)
+        unique = text.unique(maintain_order=True)
+        index = pl.DataFrame({"v": text}).join(
+            pl.DataFrame({"v": unique, "i": np.arange(len(unique))}), on="v", how="left", maintain_order="left"
+        )["i"]
+        convert = _parse_mac if kind == "mac" else _parse_technology
+        codes = np.array([convert(v, where) for v in unique.to_list()], "u1")
+        return codes[index.to_numpy()]
+
+
+def _refuse(where: str, of: Any, good: bool, wanted: str) -> None:
+    if not good:
+        raise MarchaError(f"{where}: type {of}, must be {wanted}")
+
+
+def _integers(values: NDArray[Any], field: np.dtype[Any], where: str) -> NDArray[Any]:
+    info = np.iinfo(field)
+    if len(values) and (values.min() < info.min or values.max() > info.max):
+        raise MarchaError(f"{where}: values {values.min()} to {values.max()}, the field holds {info.min} to {info.max}")
+    return values
+
+
+def _flags(series: pl.Series, where: str) -> NDArray[Any]:
+    values = series.to_numpy()
+    if series.dtype != pl.Boolean and not np.isin(values, (0, 1)).all():
+        raise MarchaError(f"{where}: values other than 0 and 1")
+    return values.astype(bool)
+
+
+def _text(value: str, where: str) -> bytes:
+    raw = value.encode()
+    if b"\x00" in raw:
+        raise MarchaError(f"{where}: {value!r} contains a NUL, which a message's string cannot hold")
+    return raw
+
+
+def _parse_mac(value: str, where: str) -> list[int]:
+    parts = value.replace("-", ":").split(":")
+    try:
+        if len(parts) != 6 or any(len(p) != 2 for p in parts):
+            raise ValueError
+        return [int(p, 16) for p in parts]
+    except ValueError:
+        raise MarchaError(f"{where}: {value!r} is not a hardware address aa:bb:cc:dd:ee:ff") from None
+
+
+def _parse_technology(value: str, where: str) -> int:
+    if value not in TECHNOLOGIES:
+        raise MarchaError(f"{where}: {value!r} is none of {', '.join(TECHNOLOGIES)}")
+    return TECHNOLOGIES.index(value)
+
+
+def check_times(values: NDArray[Any], where: str) -> NDArray[np.int64]:
+    """Return times as int64, refusing what ``builtin_interfaces/Time`` cannot hold.
+
+    Raises
+    ------
+    MarchaError
+        A time is negative or beyond :data:`MAX_TIME_NS`.
+    """
+    if len(values) and (values.min() < 0 or values.max() > MAX_TIME_NS):
+        bad = int(np.argmax((values < 0) | (values > MAX_TIME_NS)))
+        raise MarchaError(f"{where}: row {bad}: time {values[bad]} ns; it must lie between 0 and {MAX_TIME_NS}")
+    return values.astype(np.int64, copy=False)
+
+
+def record_dtype(layout: Layout) -> np.dtype[Any]:
+    """Return the structured type of a whole MCAP message record with this message layout."""
+    fields = layout.dtype.fields or {}
+    prefix = PREFIX.fields or {}
+    return np.dtype(
+        {
+            "names": [*prefix, *fields],
+            "formats": [*(f[0] for f in prefix.values()), *(f[0] for f in fields.values())],
+            "offsets": [*(f[1] for f in prefix.values()), *(f[1] + PREFIX.itemsize for f in fields.values())],
+            "itemsize": PREFIX.itemsize + layout.dtype.itemsize,
+        }
+    )
+
+
+def _field_type(dtype: np.dtype[Any], path: str) -> np.dtype[Any]:
+    fields = dtype.fields or {}
+    base, index = split_index(path)
+    return fields[path if path in fields else base if index is not None else path][0].base
+
+
+def _set(records: NDArray[Any], path: str, values: Any) -> None:
+    if path in (records.dtype.names or ()):
+        records[path] = values
+    else:
+        base, index = split_index(path)
+        records[base][..., index] = values
+
+
+def _set_time(records: NDArray[Any], path: str, t_ns: NDArray[np.int64]) -> None:
+    seconds, rest = np.divmod(t_ns, SECOND)
+    records[f"{path}.sec"] = seconds
+    records[f"{path}.nanosec"] = rest
+
+
+# ------------------------------------------------------------------------------------------------ messages to tables
+
+
+class Messages(NamedTuple):
+    """The messages of one channel within one chunk.
+
+    Attributes
+    ----------
+    data : ndarray of uint8
+        The decompressed chunk.
+    offsets, sizes : ndarray of int64
+        First byte and length of every message (behind the record's prefix).
+    log, publish : ndarray of int64
+        Log time and publish time (ns).
+    """
+
+    data: Bytes
+    offsets: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+    log: NDArray[np.int64]
+    publish: NDArray[np.int64]
+
+    def take(self, keep: NDArray[Any]) -> Messages:
+        """Return the messages that ``keep`` (mask, slice or indices) picks."""
+        return Messages(self.data, self.offsets[keep], self.sizes[keep], self.log[keep], self.publish[keep])
+
+    def message(self, i: int) -> memoryview:
+        """Return the bytes of message ``i``."""
+        start = int(self.offsets[i])
+        return memoryview(self.data)[start : start + int(self.sizes[i])]
+
+
+class Decoder:
+    """Decodes the messages of one channel into tables.
+
+    Parameters
+    ----------
+    schema : Schema or None
+        How marcha reads this type; None flattens the message as it is.
+    library : Library
+        Definitions from the recording, the channel's own first.
+    columns : sequence of str or None
+        Columns that the writer declared; None asks the messages (marks of absent values).
+    """
+
+    def __init__(self, schema: Schema | None, library: Library, columns: Sequence[str] | None = None) -> None:
+        self.schema = schema
+        self.library = library
+        self.definition = next(iter(library.values()))
+        self.columns = None if columns is None else tuple(columns)
+        self._plan: Plan | None = None
+
+    def decode(self, messages: Messages) -> pl.DataFrame:
+        """Return ``t_ns``, ``t_log_ns`` and the channel's columns, one row a message, in the order given.
+
+        Raises
+        ------
+        CdrError
+            A message does not fit the definition.
+        """
+        n = len(messages.log)
+        if n == 0:
+            return pl.DataFrame({"t_ns": [], "t_log_ns": []}, schema={"t_ns": pl.Int64, "t_log_ns": pl.Int64})
+        plan = self._plan or self._make_plan(messages.message(0))
+        block = self._fits(plan, messages)
+        if block is not None and not plan.explode:
+            self._plan = plan
+            return self._frame(plan, plan.bindings, block, messages)
+        return self._ordinary(messages)
+
+    def frame_id(self, message: memoryview) -> str:
+        """Return the frame id of a message."""
+        return self._make_plan(message).frame_id
+
+    def _make_plan(self, message: memoryview) -> Plan:
+        return Plan(self, layout_of_message(message, self.definition, self.library), message)
+
+    def _fits(self, plan: Plan, messages: Messages) -> NDArray[Any] | None:
+        """Return a structured view over all messages if each has the plan's layout, else None."""
+        size = int(messages.sizes[0])
+        if size < plan.layout.dtype.itemsize or (messages.sizes != size).any():
+            return None
+        block = _view(messages, plan.layout.dtype)
+        return block if plan.fits(block) else None
+
+    def _ordinary(self, messages: Messages) -> pl.DataFrame:
+        """Decode messages of different lengths: those of one layout together, rows back in order."""
+        plans: dict[Any, tuple[Plan, list[int]]] = {}
+        for i in range(len(messages.log)):
+            message = messages.message(i)
+            plan = self._make_plan(message)
+            plans.setdefault((plan.key, len(message)), (plan, []))[1].append(i)
+        frames: list[pl.DataFrame] = []
+        for plan, rows in plans.values():
+            part = messages.take(np.array(rows))
+            block = _view(part, plan.layout.dtype)
+            for k, bindings in enumerate(plan.rows):
+                frame = self._frame(plan, bindings, block, part, k)
+                frames.append(frame.with_columns(pl.Series("#", rows), pl.lit(k).alias("#k")))
+        if not frames:
+            return pl.DataFrame(schema={"t_ns": pl.Int64, "t_log_ns": pl.Int64})
+        return pl.concat(frames, how="diagonal_relaxed").sort("#", "#k", maintain_order=True).drop("#", "#k")
+
+    def _frame(
+        self, plan: Plan, bindings: Sequence[Binding], block: NDArray[Any], messages: Messages, row: int = 0
+    ) -> pl.DataFrame:
+        stamp = plan.stamps[row]
+        out: dict[str, Any] = {
+            "t_ns": messages.publish if stamp is None else _get_time(block, stamp),
+            "t_log_ns": messages.log,
+        }
+        for column, kind, path in bindings:
+            out[column] = _READ[kind](plan.layout, block, path)
+        return pl.DataFrame(out)
+
+
+class Plan:
+    """A layout with the columns bound to it."""
+
+    def __init__(self, decoder: Decoder, layout: Layout, message: memoryview) -> None:
+        self.layout = layout
+        self.explode = bool(decoder.schema and decoder.schema.explode)
+        record = np.frombuffer(message, layout.dtype, 1)
+        schema = decoder.schema
+        self.frame_id = layout.text(record, schema.frame if schema else "header.frame_id") or ""
+        self.rows: list[list[Binding]] = []
+        self.stamps: list[str | None] = []
+        constants: list[str] = [schema.frame if schema else "header.frame_id"]
+        if schema is None:
+            self.rows.append(_flatten(layout, decoder))
+            self.stamps.append("header.stamp" if "header.stamp.sec" in (layout.dtype.names or ()) else None)
+        elif schema.explode:
+            for k in range(layout.sequences[schema.explode]):
+                root = f"{schema.explode}[{k}]."
+                self.rows.append([Binding(c.name, c.kind, root + c.field) for c in schema.columns])
+                self.stamps.append(root + schema.stamp)
+        else:
+            names = ()
+            if schema.names:
+                count = layout.sequences[schema.names]
+                constants += [f"{schema.names}[{i}]" for i in range(count)]
+                names = tuple(layout.text(record, f"{schema.names}[{i}]") or "" for i in range(count))
+            self.rows.append(_bind(schema, layout, record, names, decoder.columns))
+            self.stamps.append(schema.stamp)
+        fields = layout.dtype.fields or {}
+        self._constants = [(p, record[p][0]) for p in constants if p in fields]
+
+    @property
+    def bindings(self) -> list[Binding]:
+        """Columns of a message that is one row."""
+        return self.rows[0]
+
+    @property
+    def key(self) -> Any:
+        """What tells plans of one channel apart."""
+        return (self.layout.key, tuple(self.rows[0]) if self.rows else (), tuple(bytes(v) for _, v in self._constants))
+
+    def fits(self, block: NDArray[Any]) -> bool:
+        """Return whether all messages have this layout and the same frame id and names."""
+        return bool(self.layout.fits(block).all()) and all((block[p] == v).all() for p, v in self._constants)
+
+
+def _bind(
+    schema: Schema, layout: Layout, record: NDArray[Any], names: tuple[str, ...], columns: tuple[str, ...] | None
+) -> list[Binding]:
+    bindings: list[Binding] = []
+    for group in schema.groups:
+        if columns is None and group.mark is not None:
+            path, value = group.mark
+            if layout.leaf(record, path)[0] == value:
+                continue
+        if schema.names:
+            sequence = group.columns[0].field.split("[")[0]
+            if layout.sequences.get(sequence, 0) < len(names):
+                continue
+        bindings += [
+            Binding(n + c.name, c.kind, c.field.replace("[i]", f"[{i}]"))
+            for c in group.columns
+            for i, n in (enumerate(names) if schema.names else [(0, "")])
+        ]
+    if columns is None:
+        return bindings
+    by_name = {b.column: b for b in bindings}
+    return [by_name[c] for c in columns if c in by_name]
+
+
+def _flatten(layout: Layout, decoder: Decoder) -> list[Binding]:
+    """Return one column a leaf of a message that marcha has no schema for."""
+    fields = layout.dtype.fields or {}
+    bindings: list[Binding] = []
+    for path, (format_, *_) in fields.items():
+        if path.endswith("#"):
+            sequence = path[:-1]
+            if sequence in layout.sequences and sequence not in fields and layout.sequences[sequence] == 0:
+                bindings.append(Binding(sequence, "list", sequence))
+            elif sequence in layout.counts and sequence not in layout.sequences and sequence not in fields:
+                bindings.append(Binding(sequence, "text", sequence))
+            continue
+        if path in ("#", "header.stamp.sec", "header.stamp.nanosec", "header.frame_id"):
+            continue
+        if path.endswith(".nanosec") and path[:-8] + ".sec" in fields:
+            continue
+        if path.endswith(".sec") and path[:-4] + ".nanosec" in fields:
+            bindings.append(Binding(path[:-4] + "_ns", "time", path[:-4]))
+        elif format_.kind == "S":
+            bindings.append(Binding(path, "text", path))
+        elif format_.shape and (path in layout.sequences or format_.shape[0] > _EXPAND):
+            bindings.append(Binding(path, "list", path))
+        elif format_.shape:
+            bindings += [Binding(f"{path}[{i}]", "number", f"{path}[{i}]") for i in range(format_.shape[0])]
+        else:
+            bindings.append(Binding(path, "number", path))
+    return [b for b in bindings if b.path != "header.frame_id"]
+
+
+def _view(messages: Messages, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return a structured array of messages of one size: a strided view where they lie evenly, else a copy."""
+    offsets = messages.offsets
+    n = len(offsets)
+    stride = int(offsets[1] - offsets[0]) if n > 1 else dtype.itemsize
+    if n < 3 or (np.diff(offsets) == stride).all():
+        return np.ndarray((n,), dtype, messages.data, int(offsets[0]), (stride,))  # type: ignore[arg-type]
+    windows = np.lib.stride_tricks.sliding_window_view(messages.data, dtype.itemsize)
+    return windows[offsets].view(dtype)[:, 0]
+
+
+def _get_time(block: NDArray[Any], path: str) -> NDArray[np.int64]:
+    return block[f"{path}.sec"].astype(np.int64) * SECOND + block[f"{path}.nanosec"]
+
+
+def _number(layout: Layout, block: NDArray[Any], path: str) -> NDArray[Any]:
+    values = layout.leaf(block, path)
+    return np.ascontiguousarray(values.astype(values.dtype.newbyteorder("="), copy=False))
+
+
+def _mac(layout: Layout, block: NDArray[Any], path: str) -> pl.Series:
+    octets = layout.leaf(block, path).astype(np.uint64)
+    code = octets @ (np.uint64(256) ** np.arange(5, -1, -1, dtype=np.uint64))
+    unique, index = np.unique(code, return_inverse=True)
+    texts = [int(u).to_bytes(6, "big").hex(":") for u in unique]
+    return pl.Series(texts, dtype=pl.String).gather(index)
+
+
+def _technology(layout: Layout, block: NDArray[Any], path: str) -> pl.Series:
+    code = np.minimum(_number(layout, block, path), len(TECHNOLOGIES))
+    return pl.Series([*TECHNOLOGIES, "unknown"], dtype=pl.String).gather(code.astype(np.int64))
+
+
+def _texts(layout: Layout, block: NDArray[Any], path: str) -> pl.Series:
+    if layout.counts.get(path, 0) == 0:
+        return pl.Series([""] * len(block), dtype=pl.String)
+    return pl.Series([decode_text(v) for v in block[path].tolist()], dtype=pl.String)
+
+
+def _list(layout: Layout, block: NDArray[Any], path: str) -> pl.Series:
+    if path not in (block.dtype.names or ()):
+        return pl.Series([[]] * len(block), dtype=pl.List(pl.Null))
+    return pl.Series(_number(layout, block, path)).cast(pl.List(pl.Series(_number(layout, block, path)[:1, 0]).dtype))
+
+
+_READ: dict[str, Any] = {
+    "number": _number,
+    "sigma": lambda layout, block, path: np.sqrt(_number(layout, block, path)),
+    "flag": lambda layout, block, path: _number(layout, block, path).astype(bool),
+    "time": lambda layout, block, path: _get_time(block, path),
+    "mac": _mac,
+    "technology": _technology,
+    "text": _texts,
+    "list": _list,
+}
+
+__all__ = ["CdrError", "Decoder", "Encoder", "Messages", "UsageError"]

@@ -1,0 +1,587 @@
+"""Reading recordings: topic and time selection, columns, windows and messages in log-time order."""
+
+from __future__ import annotations
+
+import heapq
+import json
+import os
+from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from io import BytesIO
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import msgspec
+import numpy as np
+import polars as pl
+from mcap import records
+from mcap.data_stream import ReadDataStream
+
+from .cdr import CdrError
+from .chunks import (
+    BROKEN,
+    ChunkError,
+    ChunkRef,
+    FileReader,
+    add_finding,
+    find_contents,
+    read_chunk,
+    read_index,
+    split,
+)
+from .codec import Decoder, Messages
+from .definitions import load, long_name, parse_full
+from .errors import Finding, MarchaError, UsageError
+from .schemas import SCHEMAS, Schema
+from .writer import RESERVED
+
+EVENT = "foxglove_msgs/msg/Event"
+_NOW = {"t_ns": pl.Int64, "t_log_ns": pl.Int64}
+
+
+class Channel(msgspec.Struct, frozen=True):
+    """One channel of a recording.
+
+    Attributes
+    ----------
+    topic, schema, frame_id : str
+        Topic, message type (``package/msg/Name``) and constant frame id.
+    columns : tuple of str
+        Columns of its table, without ``t_ns``; empty where marcha cannot read the messages.
+    count : int
+        Number of messages.
+    start_ns, end_ns : int or None
+        Log time of the first and last message; None where there is none.
+    metadata : dict of str to str
+        What the writer said about the channel.
+    """
+
+    topic: str
+    schema: str
+    frame_id: str
+    columns: tuple[str, ...]
+    count: int
+    start_ns: int | None
+    end_ns: int | None
+    metadata: dict[str, str] = {}
+
+
+class Attachment(msgspec.Struct, frozen=True):
+    """A file inside a recording: name, media type and size in bytes."""
+
+    name: str
+    media_type: str
+    size: int
+
+
+class Window(NamedTuple):
+    """A stretch of log time, half open, with the rows of every channel in it.
+
+    Attributes
+    ----------
+    start_ns, end_ns : int
+        ``start_ns <= t_log_ns < end_ns`` for every row.
+    tables : dict of str to polars.DataFrame
+        Topic to table with ``t_ns``, ``t_log_ns`` and the channel's columns; channels without rows are not there.
+    """
+
+    start_ns: int
+    end_ns: int
+    tables: dict[str, pl.DataFrame]
+
+
+class Message(NamedTuple):
+    """One message: topic, the time it speaks of, the time it was known, and column name to value."""
+
+    topic: str
+    t_ns: int
+    t_log_ns: int
+    values: dict[str, Any]
+
+
+@dataclass
+class _Source:
+    """What is needed to decode one topic."""
+
+    topic: str
+    ids: list[int]
+    schema: str
+    metadata: dict[str, str]
+    decoder: Decoder | None = None
+    declared: tuple[str, ...] | None = None
+
+
+class Recording:
+    """A recording opened for reading; see :func:`marcha.recording.open`.
+
+    Attributes
+    ----------
+    path : pathlib.Path
+        The file.
+    findings : list of Finding
+        What could not be read and was left out; grows while damaged chunks are met.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.path = Path(path)
+        self._file = FileReader(self.path)
+        try:
+            self._contents = find_contents(self._file)
+        except BaseException:
+            self._file.close()
+            raise
+        self.findings: list[Finding] = self._contents.findings
+        self._bad: set[int] = set()
+        self._sources = self._make_sources()
+        self._tables: dict[str, pl.DataFrame] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    # ------------------------------------------------------------------------------------------------ what is inside
+
+    @property
+    def start_ns(self) -> int:
+        """Log time of the first message (0 in an empty recording)."""
+        return min((c.first_ns for c in self._contents.chunks), default=0)
+
+    @property
+    def end_ns(self) -> int:
+        """Log time of the last message (0 in an empty recording)."""
+        return max((c.last_ns for c in self._contents.chunks), default=0)
+
+    @property
+    def duration_s(self) -> float:
+        """Seconds from the first message to the last."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+    @property
+    def profile(self) -> str:
+        """Profile of the MCAP header (``ros2``)."""
+        return self._contents.profile
+
+    @property
+    def library(self) -> str:
+        """Program that wrote the file."""
+        return self._contents.library
+
+    @cached_property
+    def channels(self) -> dict[str, Channel]:
+        """All channels by topic, in the order of their ids."""
+        spans = self._spans()
+        return {t: self._describe(s, spans) for t, s in self._sources.items()}
+
+    @cached_property
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Metadata records: name to its keys and values."""
+        out: dict[str, dict[str, str]] = {}
+        for index in self._contents.metadata:
+            try:
+                record = records.Metadata.read(self._stream(index.offset, index.length))
+            except BROKEN as e:
+                add_finding(self.findings, "bad_metadata", f"{index.name}: {e or type(e).__name__}; left out")
+                continue
+            out.setdefault(record.name, {}).update(record.metadata)
+        return out
+
+    @cached_property
+    def attachments(self) -> list[Attachment]:
+        """Attached files, without their contents."""
+        return [Attachment(a.name, a.media_type, a.data_size) for a in self._contents.attachments]
+
+    def attachment(self, name: str) -> bytes:
+        """Return the contents of an attachment.
+
+        Raises
+        ------
+        UsageError
+            There is none of this name.
+        MarchaError
+            Its record is broken.
+        """
+        for index in self._contents.attachments:
+            if index.name == name:
+                try:
+                    record = records.Attachment.read(self._stream(index.offset, index.length))
+                except BROKEN as e:
+                    raise MarchaError(f"{self.path}: attachment {name!r}: {e or type(e).__name__}") from None
+                return record.data
+        names = ", ".join(a.name for a in self.attachments) or "none"
+        raise UsageError(f"{self.path}: no attachment {name!r}; there are: {names}")
+
+    @cached_property
+    def annotations(self) -> pl.DataFrame:
+        """Annotations by start time: ``tier, start_ns, end_ns, label, metadata`` (JSON text)."""
+        from .annotations import read_annotations
+
+        return read_annotations(self)
+
+    # ------------------------------------------------------------------------------------------------ reading
+
+    def table(
+        self, topic: str, start_ns: int | None = None, end_ns: int | None = None, log_time: bool = False
+    ) -> pl.DataFrame:
+        """Return a channel as a table.
+
+        Parameters
+        ----------
+        topic : str
+            A key of :attr:`channels`.
+        start_ns, end_ns : int, optional
+            Half-open range of log time.
+        log_time : bool
+            Whether to add ``t_log_ns``, when each message was known.
+
+        Returns
+        -------
+        polars.DataFrame
+            ``t_ns`` (Int64, the time a row speaks of), then the channel's columns, in log-time order.
+
+        Raises
+        ------
+        UsageError
+            No such topic.
+        MarchaError
+            The messages are of a kind that marcha cannot read.
+        """
+        source = self._source(topic)
+        refs = self._refs(set(source.ids), start_ns, end_ns)
+        parts: list[pl.DataFrame] = []
+        with _Pool(len(refs)) as pool:
+            for tables in pool.map(lambda ref: self._decode(ref, [source], start_ns, end_ns), refs):
+                parts += tables.values()
+        table = _join(parts, self._empty(source))
+        return table if log_time else table.drop("t_log_ns")
+
+    def windows(
+        self,
+        topics: Collection[str] | None = None,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        max_rows: int = 65536,
+    ) -> Iterator[Window]:
+        """Yield the recording in stretches of log time, disjoint and in order.
+
+        Memory holds about ``max_rows`` rows and one chunk a channel, whatever the length of the recording.
+
+        Parameters
+        ----------
+        topics : collection of str, optional
+            Channels to read, default all that can be read.
+        start_ns, end_ns : int, optional
+            Half-open range of log time.
+        max_rows : int
+            Rows of all channels together in a window; more only where that many share one log time.
+
+        Yields
+        ------
+        Window
+        """
+        sources = self._select(topics)
+        ids = {i for s in sources for i in s.ids}
+        refs = sorted(self._refs(ids, start_ns, end_ns), key=lambda r: (r.first_ns, r.start))
+        held: dict[str, list[pl.DataFrame]] = {s.topic: [] for s in sources}
+        with _Pool(len(refs)) as pool:
+            decoded = pool.map(lambda ref: self._decode(ref, sources, start_ns, end_ns), refs)
+            for i, tables in enumerate(decoded):
+                for topic, table in tables.items():
+                    if table.height:
+                        held[topic].append(table)
+                horizon = refs[i + 1].first_ns if i + 1 < len(refs) else None
+                if horizon is None or _complete(held, horizon) >= max_rows:
+                    yield from self._emit(held, horizon, max_rows)
+
+    def messages(
+        self, topics: Collection[str] | None = None, start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Message]:
+        """Yield every message in log-time order, ties by channel order; see :meth:`windows`."""
+        order = {t: i for i, t in enumerate(self._sources)}
+        for window in self.windows(topics, start_ns, end_ns):
+            streams = [
+                _rows(topic, order[topic], table) for topic, table in sorted(window.tables.items(), key=lambda t: order[t[0]])
+            ]
+            for *_, message in heapq.merge(*streams, key=lambda m: m[:3]):
+                yield message
+
+    # ------------------------------------------------------------------------------------------------ inside
+
+    def _stream(self, start: int, length: int) -> ReadDataStream:
+        return ReadDataStream(BytesIO(self._file.read(start + 9, length - 9)))
+
+    def _make_sources(self) -> dict[str, _Source]:
+        out: dict[str, _Source] = {}
+        for id_, channel in sorted(self._contents.channels.items()):
+            record = self._contents.schemas.get(channel.schema_id)
+            name = long_name(record.name) if record else ""
+            topic = channel.topic
+            if topic in out:
+                if out[topic].schema == name and out[topic].metadata == dict(channel.metadata):
+                    out[topic].ids.append(id_)
+                    continue
+                topic = f"{channel.topic}#{id_}"
+                add_finding(self.findings, "duplicate_topic", f"{channel.topic}: several channels; read as {topic}")
+            source = _Source(topic, [id_], name, dict(channel.metadata))
+            out[topic] = source
+            try:
+                source.decoder = self._make_decoder(source, channel, record)
+            except (MarchaError, CdrError, UnicodeDecodeError) as e:
+                add_finding(self.findings, "unreadable_channel", f"{topic}: {e}; listed, not read")
+        return out
+
+    def _make_decoder(self, source: _Source, channel: records.Channel, record: records.Schema | None) -> Decoder:
+        if channel.message_encoding != "cdr":
+            raise MarchaError(f"message encoding {channel.message_encoding!r}, only cdr is read")
+        known: Schema | None = SCHEMAS.get(source.schema)
+        if record is None or (record.encoding != "ros2msg" and known is None):
+            raise MarchaError(f"schema encoding {record.encoding if record else 'none'!r}, only ros2msg is read")
+        if record.encoding == "ros2msg":
+            library = parse_full(record.name, record.data.decode())
+            ours = load(source.schema) if known else {}
+            if known and any(library.get(k) is None or library[k].fields != d.fields for k, d in ours.items()):
+                known = None  # somebody's own message of the same name: take it as it is
+        else:
+            library = load(source.schema)
+        text = source.metadata.get("columns")
+        if known is not None and text is not None and "frame_id" in source.metadata:
+            try:
+                source.declared = tuple(str(c) for c in json.loads(text))
+            except ValueError:
+                source.declared = None
+        return Decoder(known, library, source.declared)
+
+    def _source(self, topic: str) -> _Source:
+        source = self._sources.get(topic)
+        if source is None:
+            topics = ", ".join(self._sources) or "none"
+            raise UsageError(f"{self.path}: no topic {topic!r}; there are: {topics}")
+        if source.decoder is None:
+            raise MarchaError(f"{self.path}: {topic}: messages of type {source.schema or 'unknown'} cannot be read")
+        return source
+
+    def _select(self, topics: Collection[str] | None) -> list[_Source]:
+        if topics is None:
+            return [s for s in self._sources.values() if s.decoder is not None]
+        wanted = set([topics] if isinstance(topics, str) else topics)
+        for topic in sorted(wanted):
+            self._source(topic)
+        return [s for t, s in self._sources.items() if t in wanted]
+
+    def _refs(self, ids: set[int], start_ns: int | None, end_ns: int | None) -> list[ChunkRef]:
+        return [
+            c
+            for c in self._contents.chunks
+            if (not c.indexes or ids.intersection(c.indexes))
+            and (start_ns is None or c.last_ns >= start_ns)
+            and (end_ns is None or c.first_ns < end_ns)
+        ]
+
+    def _decode(
+        self, ref: ChunkRef, sources: Sequence[_Source], start_ns: int | None, end_ns: int | None
+    ) -> dict[str, pl.DataFrame]:
+        """Return the rows of one chunk by topic; a broken chunk gives none and a finding."""
+        topic_of = {i: s for s in sources for i in s.ids}
+        try:
+            parts = split(read_chunk(self._file, ref), topic_of)
+        except ChunkError as e:
+            self._lost(ref, str(e))
+            return {}
+        out: dict[str, pl.DataFrame] = {}
+        for id_, messages in sorted(parts.items()):
+            source = topic_of[id_]
+            keep = _between(messages, start_ns, end_ns)
+            if keep is not None:
+                messages = messages.take(keep)
+            if not len(messages.log):
+                continue
+            assert source.decoder is not None
+            try:
+                table = source.decoder.decode(messages)
+            except CdrError as e:
+                self._lost(ref, f"{source.topic}: chunk at byte {ref.start}: {e}")
+                continue
+            out[source.topic] = _join([out[source.topic], table]) if source.topic in out else table
+        return out
+
+    def _lost(self, ref: ChunkRef, detail: str) -> None:
+        if ref.start not in self._bad:
+            self._bad.add(ref.start)
+            add_finding(self.findings, "bad_chunk", f"{detail}; skipped")
+
+    def _emit(self, held: dict[str, list[pl.DataFrame]], horizon: int | None, max_rows: int) -> Iterator[Window]:
+        """Yield what lies before ``horizon`` in windows of ``max_rows``; keep the rest."""
+        ready: dict[str, pl.DataFrame] = {}
+        for topic, parts in held.items():
+            if not parts:
+                continue
+            table = _join(parts)
+            at = table.height if horizon is None else int(table["t_log_ns"].search_sorted(horizon, side="left"))
+            ready[topic] = table.slice(0, at)
+            held[topic] = [table.slice(at)] if at < table.height else []
+        ready = {t: v for t, v in ready.items() if v.height}
+        if not ready:
+            return
+        times = np.sort(np.concatenate([t["t_log_ns"].to_numpy() for t in ready.values()]))
+        cuts = [int(times[0])]
+        at = 0
+        while at < len(times):
+            at = min(at + max_rows, len(times))
+            if at < len(times):  # a window ends before a log time, never amid rows that share it
+                left = int(np.searchsorted(times, times[at], side="left"))
+                at = left if times[at] > cuts[-1] else int(np.searchsorted(times, times[at], side="right"))
+            cuts.append(int(times[at]) if at < len(times) else int(times[-1]) + 1)
+        for start, end in zip(cuts, cuts[1:], strict=False):
+            tables = {}
+            for topic, table in ready.items():
+                log = table["t_log_ns"]
+                i, j = (int(log.search_sorted(t, side="left")) for t in (start, end))
+                if j > i:
+                    tables[topic] = table.slice(i, j - i)
+            yield Window(start, end, tables)
+
+    def _empty(self, source: _Source) -> pl.DataFrame:
+        columns = self.channels[source.topic].columns
+        known = SCHEMAS.get(source.schema)
+        kinds = {c.name: c for c in known.columns} if known else {}
+        types: dict[str, Any] = {"number": pl.Float64, "sigma": pl.Float64, "flag": pl.Boolean, "time": pl.Int64}
+        schema = {c: types.get(kinds[c].kind, pl.String) if c in kinds else pl.Float64 for c in columns}
+        return pl.DataFrame(schema=_NOW | schema)
+
+    def _describe(self, source: _Source, spans: dict[int, tuple[int, int, int]]) -> Channel:
+        here = [spans[i] for i in source.ids if i in spans]
+        count = sum(s[0] for s in here)
+        columns, frame_id = source.declared or (), source.metadata.get("frame_id", "")
+        if source.declared is None and source.decoder is not None and count:
+            columns, frame_id = self._first(source)
+        return Channel(
+            source.topic,
+            source.schema,
+            frame_id,
+            columns,
+            count,
+            min((s[1] for s in here), default=None),
+            max((s[2] for s in here), default=None),
+            {k: v for k, v in source.metadata.items() if k not in RESERVED},
+        )
+
+    def _first(self, source: _Source) -> tuple[tuple[str, ...], str]:
+        """Return columns and frame id of a foreign channel from its first readable chunk."""
+        for ref in self._refs(set(source.ids), None, None):
+            try:
+                parts = split(read_chunk(self._file, ref), source.ids)
+            except ChunkError as e:
+                self._lost(ref, str(e))
+                continue
+            for messages in parts.values():
+                assert source.decoder is not None
+                try:
+                    table = source.decoder.decode(messages.take(slice(0, 1)))
+                    return tuple(table.columns[2:]), source.decoder.frame_id(messages.message(0))
+                except CdrError as e:
+                    add_finding(self.findings, "unreadable_channel", f"{source.topic}: {e}; listed, not read")
+                    source.decoder = None
+                    return (), ""
+        return (), ""
+
+    def _spans(self) -> dict[int, tuple[int, int, int]]:
+        """Return count, first and last log time of every channel id."""
+        spans: dict[int, tuple[int, int, int]] = {}
+
+        def add(id_: int, count: int, first: int, last: int) -> None:
+            old = spans.get(id_)
+            spans[id_] = (count, first, last) if old is None else (
+                old[0] + count, min(old[1], first), max(old[2], last))
+
+        for ref in self._contents.chunks:
+            times = self._times(ref)
+            for id_, log in times.items():
+                if len(log):
+                    add(id_, len(log), int(log.min()), int(log.max()))
+        return spans
+
+    def _times(self, ref: ChunkRef) -> dict[int, Any]:
+        if ref.index_length and not ref.loose:
+            try:
+                times = read_index(self._file, ref)
+            except ChunkError:
+                times = {}
+            if times:
+                return times
+        try:
+            return {k: m.log for k, m in split(read_chunk(self._file, ref), None).items()}
+        except ChunkError as e:
+            self._lost(ref, str(e))
+            return {}
+
+
+class _Pool:
+    """Threads that keep order and run only a few tasks ahead."""
+
+    def __init__(self, tasks: int) -> None:
+        self._workers = min(4, os.cpu_count() or 1, max(1, tasks))
+
+    def __enter__(self) -> Self:
+        self._pool = ThreadPoolExecutor(self._workers, thread_name_prefix="marcha-read")
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def map(self, task: Any, items: Sequence[Any]) -> Iterator[Any]:
+        """Yield the result of every item in order."""
+        from collections import deque
+
+        jobs: deque[Any] = deque()
+        for item in items:
+            jobs.append(self._pool.submit(task, item))
+            if len(jobs) > self._workers:
+                yield jobs.popleft().result()
+        while jobs:
+            yield jobs.popleft().result()
+
+
+def _between(messages: Messages, start_ns: int | None, end_ns: int | None) -> Any:
+    if start_ns is None and end_ns is None:
+        return None
+    keep = np.ones(len(messages.log), bool)
+    if start_ns is not None:
+        keep &= messages.log >= start_ns
+    if end_ns is not None:
+        keep &= messages.log < end_ns
+    return keep
+
+
+def _join(parts: list[pl.DataFrame], empty: pl.DataFrame | None = None) -> pl.DataFrame:
+    """Return the parts as one table in log-time order (stable)."""
+    if not parts:
+        assert empty is not None
+        return empty
+    same = all(p.schema == parts[0].schema for p in parts)
+    table = pl.concat(parts, how="vertical" if same else "diagonal_relaxed", rechunk=True)
+    log = table["t_log_ns"]
+    return table if log.is_sorted() else table.sort("t_log_ns", maintain_order=True)
+
+
+def _complete(held: dict[str, list[pl.DataFrame]], horizon: int) -> int:
+    return sum(
+        t.height if t["t_log_ns"][-1] < horizon else int(t["t_log_ns"].search_sorted(horizon, side="left"))
+        for parts in held.values()
+        for t in parts
+    )
+
+
+def _rows(topic: str, order: int, table: pl.DataFrame) -> Iterator[tuple[int, int, int, Message]]:
+    names = [c for c in table.columns if c not in _NOW]
+    values = table.select(names).rows() if names else [()] * table.height
+    times = zip(table["t_ns"].to_list(), table["t_log_ns"].to_list(), values, strict=True)
+    for i, (t_ns, log, row) in enumerate(times):
+        yield log, order, i, Message(topic, t_ns, log, dict(zip(names, row, strict=True)))
