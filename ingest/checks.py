@@ -99,7 +99,7 @@ class SensorCheck:
                 )
 
     def finish(self, *, scale_hint: str = "") -> None:
-        """Report what only the whole stream can tell; ``scale_hint`` is what to check if units are in doubt."""
+        """Report what only the whole stream can tell; ``scale_hint`` is what to check in doubt."""
         if self._rows >= STALE_ROWS:
             for group in ("acc", "gyr"):
                 idx = [i for i, c in enumerate(self._columns) if c.startswith(group)]

@@ -175,8 +175,8 @@ class Clock:
                     move = last + (self._nominal or 1) - int(ticks[a])
                     self._report.repair(
                         "backwards_time",
-                        f"{self._subject}the clock steps back by {self._text(last - int(ticks[a]))} and goes on "
-                        f"from there: all rows from here on moved by {self._text(move)}",
+                        f"{self._subject}the clock steps back by {self._text(last - int(ticks[a]))} and "
+                        f"runs on from there: all rows from here on moved by {self._text(move)}",
                         rows=ticks.size - a,
                         line=lines[a],
                         subject=self._subject + "restart",
@@ -209,8 +209,8 @@ class Clock:
         off = int(ticks[a]) - (last or 0)
         self._report.drop(
             "backwards_time",
-            f"{self._subject}time is {self._text(abs(off))} {'ahead of' if off > 0 else 'before'} its neighbours "
-            "and comes back: row dropped",
+            f"{self._subject}time is {self._text(abs(off))} {'ahead of' if off > 0 else 'before'} its "
+            "neighbours: row dropped",
             count=b - a,
             line=lines[a],
             subject=self._subject,

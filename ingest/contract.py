@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Protocol, runtime_checkable
 import msgspec
 import polars as pl
 
-from ..recording.errors import Finding
+from ..recording.errors import Finding, MarchaError
 
 #: Bytes of a file that :meth:`Importer.sniff` is shown.
 HEAD_BYTES = 65536
@@ -30,7 +30,8 @@ class CommonOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         bool | None, msgspec.Meta(description="the walk ends where it began (truth for the closure metric)")
     ] = None
     length_m: Annotated[
-        float | None, msgspec.Meta(gt=0, description="true length of the walk in metres, where it is known")
+        Annotated[float, msgspec.Meta(gt=0)] | None,
+        msgspec.Meta(description="true length of the walk in metres, where it is known"),
     ] = None
     epoch: Annotated[
         str | None,
@@ -123,7 +124,20 @@ class ReportBuilder:
         self.repaired = 0
         self.dropped = 0
         self._lost = False
+        self._strict: Path | None = None
         self._findings: dict[tuple[str, str], Finding] = {}
+
+    def refuse_changes(self, source: Path) -> None:
+        """Raise at the first row of ``source`` that is dropped or repaired, also where that has happened."""
+        self._strict = source
+        if self.dropped or self.repaired:
+            first = self.build().findings[0]
+            self._refuse(first.kind, first.detail, first.first_line)
+
+    def _refuse(self, kind: str, detail: str, line: int | None) -> None:
+        if self._strict is not None:
+            where = "" if line is None else f", line {line}"
+            raise MarchaError(f"{self._strict}{where}: {kind}: {detail}; leave out --strict to accept that")
 
     def keep(self, rows: int) -> None:
         """Count ``rows`` that became messages."""
@@ -134,6 +148,8 @@ class ReportBuilder:
     ) -> None:
         """Count rows that become nothing, and say why."""
         self.dropped += int(count)
+        if count:
+            self._refuse(kind, detail, line)
         self.note(kind, detail, count=count, line=line, subject=subject)
 
     def repair(
@@ -148,6 +164,8 @@ class ReportBuilder:
     ) -> None:
         """Say what was changed; ``rows`` (default ``count``) of the kept rows were touched."""
         self.repaired += int(count if rows is None else rows)
+        if count:
+            self._refuse(kind, detail, line)
         self.note(kind, detail, count=count, line=line, subject=subject)
 
     def loss(
@@ -231,6 +249,10 @@ class Import:
         yield from self._blocks
         self._blocks = ()
         self._done = True
+
+    def refuse_changes(self, source: Path) -> None:
+        """Make the blocks raise at the first row that is dropped or repaired (``--strict``)."""
+        self._builder.refuse_changes(source)
 
     @property
     def report(self) -> Report:

@@ -47,8 +47,8 @@ class Mpu6050Options(CommonOptions, frozen=True, kw_only=True):
     """
 
     conf: Annotated[
-        str | None,
-        msgspec.Meta(pattern="^[0-3]{4}$", description="full-scale codes A1G1A2G2, four digits 0–3"),
+        Annotated[str, msgspec.Meta(pattern="^[0-3]{4}$")] | None,
+        msgspec.Meta(description="full-scale codes A1G1A2G2, four digits 0–3"),
     ] = None
     accel1_g: AccRange = None
     gyro1_dps: GyrRange = None
@@ -129,8 +129,8 @@ def scales(
                 sources.add("option conf" if options.conf else "file name")
             else:
                 raise UsageError(
-                    f"{paths[0]}: the full scale of sensor {sensor} is unknown: name the file conf-A1G1A2G2… or give "
-                    f"--set conf=A1G1A2G2 (codes 0–3) or --set {fields[0]}=… --set {fields[1]}=…"
+                    f"{paths[0]}: the full scale of sensor {sensor} is unknown: name the file conf-A1G1A2G2… "
+                    f"or give --set conf=A1G1A2G2 (codes 0–3) or --set {fields[0]}=… --set {fields[1]}=…"
                 )
         (acc_g, per_g), (dps, per_dps) = values
         found[sensor] = Scale(

@@ -1,8 +1,8 @@
 """Serial text of two MPU-6050 on one shoe: ``t_ms`` and twelve counts of the 16-bit converter a row.
 
-A row is ``t_ms, ax1, ay1, az1, gx1, gy1, gz1, ax2, ay2, az2, gx2, gy2, gz2``; ``t_ms`` is the controller's ``millis()``,
-unsigned 32 bit, so it wraps every 49.7 days. Axes are those printed on the sensor; the accelerometer
-reads +1 g upwards at rest.
+A row is ``t_ms, ax1, ay1, az1, gx1, gy1, gz1, ax2, ay2, az2, gx2, gy2, gz2``; ``t_ms`` is the controller's
+``millis()``, unsigned 32 bit, so it wraps every 49.7 days. Axes are those printed on the sensor; the
+accelerometer reads +1 g upwards at rest.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ LIMITS = ((0, 2**32 - 1), *[(-32768, 32767)] * 12)
 STEP_MS = (0, 1000)
 
 _ROW = re.compile(
-    rb"\s*(?:(?:[\d/.-]{10}[ T])?\d\d:\d\d:\d\d(?:[.,:]\d+)?[\s>-]+)?(\d+)(?:(?:[ \t]*[,;][ \t]*|[ \t]+)[+-]?\d+){12}[\s,;]*"
+    rb"\s*(?:(?:[\d/.-]{10}[ T])?\d\d:\d\d:\d\d(?:[.,:]\d+)?[\s>-]+)?"  # a terminal's wall clock
+    rb"(\d+)(?:(?:[ \t]*[,;][ \t]*|[ \t]+)[+-]?\d+){12}[\s,;]*"
 )
 
 

@@ -70,9 +70,9 @@ def integer_rows(
 ) -> Iterator[Rows]:
     """Read lines of ``len(limits)`` integers between commas, semicolons, tabs or spaces.
 
-    Lines end in LF, CRLF or CR, also mixed. A wall clock in front (``12:34:56.789``, with or without a date) is taken
-    off. Blank lines are nothing; lines of words are ``chatter``; any other line that is not a row is dropped
-    as ``bad_row`` with the reason.
+    Lines end in LF, CRLF or CR, also mixed. A wall clock in front (``12:34:56.789``, with or without a date)
+    is taken off. Blank lines are nothing; lines of words are ``chatter``; any other line that is not a row is
+    dropped as ``bad_row`` with the reason.
 
     Parameters
     ----------

@@ -167,7 +167,7 @@ def scan(data, low, high, first_line, values, lines, wall, odd):
                 while i < b and _space(data[i]):
                     i += 1
         if status == NOT_A_NUMBER and column == 0:
-            # Words (boot messages) are no damaged row; what begins with a sign, a separator or no text is one.
+            # Words (boot messages) are no damaged row; what begins with a sign or a separator is one.
             c = data[a]
             words = (65 <= c <= 90) or (97 <= c <= 122) or c == 35 or c == 91 or c == 42 or c == 61
             separators = 0

@@ -1,0 +1,252 @@
+"""Raw log in, recording out: finds the format, streams it, and keeps where everything came from."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+import polars as pl
+
+from .. import recording as mr
+from ..recording.errors import MarchaError, OutputExists, UsageError
+from . import registry
+from .contract import ChannelSpec, CommonOptions, Import, Report, SourceAttachment
+from .truth import Truth, as_text, read_truth
+
+T = TypeVar("T")
+
+
+class ConvertedChannel(msgspec.Struct, frozen=True):
+    """One channel of the result; times in ns, None where it stayed empty."""
+
+    topic: str
+    schema: str
+    count: int
+    start_ns: int | None
+    end_ns: int | None
+
+
+class Converted(msgspec.Struct, frozen=True):
+    """What :func:`convert` did, with the keys of ``marcha convert --json``."""
+
+    output: str
+    format: str
+    channels: list[ConvertedChannel]
+    report: Report
+
+
+def convert(
+    paths: Path | str | Sequence[Path | str],
+    out: Path | str,
+    *,
+    format: str | None = None,
+    mapping: Path | str | None = None,
+    options: Mapping[str, Any] | None = None,
+    strict: bool = False,
+    overwrite: bool = False,
+    progress: Callable[[int], None] | None = None,
+) -> Converted:
+    """Convert a raw log to a recording.
+
+    Parameters
+    ----------
+    paths : path or sequence of paths
+        File, folder or zip archive; several only where the format's files are pieces of one recording.
+    out : path
+        The recording; appears whole or not at all.
+    format : str, optional
+        Name of the format; without it content decides.
+    mapping : path, optional
+        TOML mapping of a table's columns; implies the format ``table``.
+    options : mapping, optional
+        The format's options (``marcha formats``), values also as text.
+    strict : bool
+        Fail where a row would be dropped or repaired.
+    overwrite : bool
+        Replace an existing recording.
+    progress : callable, optional
+        Called with the number of messages written so far.
+
+    Raises
+    ------
+    MarchaError
+        One line with file, rule, value and remedy. Nothing is written then.
+    """
+    sources = [Path(p) for p in ([paths] if isinstance(paths, str | Path) else paths)]
+    out = Path(out)
+    chosen = dict(options or {})
+    if mapping is not None:
+        if format not in (None, "table"):
+            raise UsageError(f"--map belongs to the format table, not to {format}")
+        format, chosen["mapping"] = "table", str(mapping)
+    if out.is_dir():
+        raise MarchaError(f"{out}: is a folder; give the name of the recording to write")
+    if out.exists() and any(s.exists() and out.samefile(s) for s in sources):
+        raise UsageError(f"{out}: is the source itself; give the recording another name")
+    if out.exists() and not overwrite:
+        raise OutputExists(out)
+    with contextlib.ExitStack() as stack:
+        registered, files = registry.choose(sources, format, stack)
+        settings = registry.make_options(registered.importer, chosen)
+        truth = read_truth(files[0])
+        hashes = stack.enter_context(ThreadPoolExecutor(1)).submit(_sources, files, truth)
+        imported = registered.importer.read(files, settings)
+        if strict:
+            imported.refuse_changes(files[0])
+        provenance = {
+            "importer": registered.importer.name,
+            "importer_version": registered.source,
+            "options": msgspec.json.encode(chosen, order="sorted").decode(),
+            "tool": f"marcha {version('marcha')}",
+            "given": ", ".join(p.name for p in sources),
+        }
+        try:
+            with mr.create(out, overwrite=overwrite) as recording:
+                written = _Writer(recording, settings, progress)
+                for spec in imported.channels:
+                    written.declare(spec)
+                for topic, table in _ahead(imported.blocks()):
+                    written.add(topic, table)
+                report = imported.report
+                for spec, table in truth.tables if truth else ():
+                    written.declare(spec)
+                    written.add(spec.topic, table)
+                provenance["sources"] = msgspec.json.encode(hashes.result()).decode()
+                for name, record in _metadata(imported, settings, truth, provenance, report).items():
+                    recording.add_metadata(name, record)
+                for item in [*imported.attachments, *(_raw(files) if settings.keep_source else ())]:
+                    recording.add_attachment(item.name, item.data, item.media_type)
+        except OSError as error:
+            where = error.filename or out
+            raise MarchaError(f"{where}: {error.strerror or error}; nothing was written to {out}") from error
+    return Converted(str(out), registered.importer.name, written.channels(), report)
+
+
+class _Writer:
+    """Hands tables to the recording, moved to UTC where asked, and counts them."""
+
+    def __init__(
+        self, recording: Any, options: CommonOptions, progress: Callable[[int], None] | None
+    ) -> None:
+        self._recording = recording
+        self._progress = progress
+        self._total = 0
+        self._start = None if options.start is None else _instant("start", options.start)
+        self._shift = 0 if options.epoch is None else _instant("epoch", options.epoch)
+        if options.start is not None and options.epoch is not None:
+            raise UsageError("start and epoch both say when the device's clock began; give one")
+        self._specs: dict[str, ChannelSpec] = {}
+        self._counts: dict[str, tuple[int, int | None, int | None]] = {}
+
+    def declare(self, spec: ChannelSpec) -> None:
+        self._specs[spec.topic] = spec
+        self._counts[spec.topic] = (0, None, None)
+        self._recording.add_channel(
+            spec.topic,
+            spec.schema,
+            frame_id=spec.frame_id,
+            columns=spec.columns or None,
+            metadata=spec.metadata,
+        )
+
+    def add(self, topic: str, table: pl.DataFrame) -> None:
+        if not table.height:
+            return
+        if self._start is not None:  # the first sample is that of the first block
+            self._shift, self._start = self._start - int(table["t_ns"][0]), None
+        if self._shift:
+            table = table.with_columns(pl.col("t_ns") + self._shift)
+        spec = self._specs[topic]
+        self._recording.add_table(topic, spec.schema, table, frame_id=spec.frame_id)
+        count, first, _ = self._counts[topic]
+        t = table["t_ns"]
+        self._counts[topic] = (count + table.height, int(t[0]) if first is None else first, int(t[-1]))
+        self._total += table.height
+        if self._progress is not None:
+            self._progress(self._total)
+
+    def channels(self) -> list[ConvertedChannel]:
+        return [
+            ConvertedChannel(topic, self._specs[topic].schema, *numbers)
+            for topic, numbers in self._counts.items()
+        ]
+
+
+def _ahead(items: Iterator[T]) -> Iterator[T]:
+    """Read one item ahead in a thread: parsing and writing use a core each."""
+    end = object()
+    with ThreadPoolExecutor(1) as pool:
+        coming = pool.submit(next, items, end)
+        while (item := coming.result()) is not end:
+            coming = pool.submit(next, items, end)
+            yield item  # type: ignore[misc]
+
+
+def _instant(option: str, text: str) -> int:
+    """Return an ISO 8601 time as ns since 1970, UTC where it names no zone."""
+    try:
+        at = datetime.fromisoformat(text)
+    except ValueError:
+        raise UsageError(
+            f"option {option}={text!r} is no ISO 8601 time, such as 2026-11-21T10:00:00Z"
+        ) from None
+    at = at if at.tzinfo else at.replace(tzinfo=UTC)
+    since = at - datetime(1970, 1, 1, tzinfo=UTC)
+    nanoseconds = (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1000
+    if nanoseconds < 0:
+        raise UsageError(f"option {option}={text!r} lies before 1970")
+    return nanoseconds
+
+
+def _metadata(
+    imported: Import,
+    options: CommonOptions,
+    truth: Truth | None,
+    provenance: dict[str, str],
+    report: Report,
+) -> dict[str, dict[str, str]]:
+    records = {name: dict(record) for name, record in imported.metadata.items()}
+    if options.epoch is not None or options.start is not None:
+        records.setdefault("device", {})["clock"] = "utc"
+    known = dict(truth.metadata) if truth else {}
+    for key in ("closed", "length_m"):
+        if (value := getattr(options, key)) is not None:
+            known[key] = as_text(value)
+    if known:
+        records["truth"] = records.get("truth", {}) | known
+    records["provenance"] = provenance
+    records["import_report"] = {
+        **{k: str(getattr(report, k)) for k in ("rows_read", "rows_kept", "rows_repaired", "rows_dropped")},
+        "findings": msgspec.json.encode(report.findings).decode(),
+    }
+    return records
+
+
+def _files(paths: Sequence[Path]) -> Iterator[tuple[str, Path]]:
+    for path in paths:
+        if path.is_dir():
+            yield from ((p.relative_to(path).as_posix(), p) for p in sorted(path.rglob("*")) if p.is_file())
+        else:
+            yield path.name, path
+
+
+def _sources(paths: Sequence[Path], truth: Truth | None) -> list[dict[str, str | int]]:
+    """Return name, size and BLAKE2b hash of every source file."""
+    found = []
+    for name, path in _files([*paths, *(truth.files if truth else ())]):
+        with path.open("rb") as f:
+            digest = hashlib.file_digest(f, "blake2b").hexdigest()
+        found.append({"name": name, "size": path.stat().st_size, "blake2b": digest})
+    return found
+
+
+def _raw(paths: Sequence[Path]) -> Iterator[SourceAttachment]:
+    for name, path in _files(paths):
+        yield SourceAttachment(f"source/{name}", path.read_bytes(), "application/octet-stream")

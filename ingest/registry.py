@@ -1,0 +1,333 @@
+"""Which importers there are, and which of them a source belongs to."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import warnings
+import zipfile
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from ..recording.errors import MarchaError, UsageError
+from .contract import HEAD_BYTES, CommonOptions, Importer
+from .truth import is_side_file
+
+GROUP = "marcha.importers"
+
+#: Confidence below which a format is not a candidate, and the lead that the first must have over the second.
+CANDIDATE, LEAD = 0.3, 0.1
+
+
+class Registered(NamedTuple):
+    """One importer and where it comes from.
+
+    Attributes
+    ----------
+    importer : Importer
+        An instance.
+    source : str
+        Distribution and version, for provenance.
+    """
+
+    importer: Importer
+    source: str
+
+
+class OptionInfo(msgspec.Struct, frozen=True):
+    """One option of a format: name, type, default and description, as text."""
+
+    name: str
+    type: str
+    default: str
+    description: str
+
+
+class FormatInfo(msgspec.Struct, frozen=True):
+    """One format as ``marcha formats`` shows it."""
+
+    name: str
+    title: str
+    source: str
+    joins: bool
+    doc: str
+    options: list[OptionInfo]
+
+
+class Candidate(msgspec.Struct, frozen=True):
+    """A format that may fit, and how surely."""
+
+    name: str
+    confidence: float
+
+
+@cache
+def importers() -> dict[str, Registered]:
+    """Return all importers by name; a broken plug-in is a warning with its name."""
+    found: dict[str, Registered] = {}
+    for point in sorted(entry_points(group=GROUP), key=lambda p: p.name):
+        try:
+            importer = point.load()()
+            _check(importer)
+        except Exception as error:
+            warnings.warn(f"importer plug-in {_label(point)} cannot be used: {error!r}", stacklevel=2)
+            continue
+        if importer.name in found:
+            first = found[importer.name].source
+            warnings.warn(
+                f"importer plug-in {_label(point)} is left out: {first} has {importer.name!r} already",
+                stacklevel=2,
+            )
+            continue
+        found[importer.name] = Registered(importer, _distribution(point))
+    return found
+
+
+def get(name: str) -> Registered:
+    """Return one importer.
+
+    Raises
+    ------
+    UsageError
+        There is none of that name.
+    """
+    known = importers()
+    if name not in known:
+        raise UsageError(f"unknown format {name!r}; one of {', '.join(known)}")
+    return known[name]
+
+
+def formats() -> list[FormatInfo]:
+    """Return every format with its options and their documentation."""
+    return [_info(r) for r in importers().values()]
+
+
+def make_options(importer: Importer, values: Mapping[str, Any]) -> CommonOptions:
+    """Build an importer's options from a mapping; text is converted ("true", "22.1").
+
+    Raises
+    ------
+    UsageError
+        An option is unknown or its value does not fit.
+    """
+    known = {f.name for f in msgspec.structs.fields(importer.Options)}
+    for key in values:
+        if key not in known:
+            raise UsageError(
+                f"format {importer.name} has no option {key!r}; it has {', '.join(sorted(known))}"
+            )
+    for key, value in values.items():  # one by one, so that the message can name the option
+        try:
+            msgspec.convert({key: value}, importer.Options, strict=False)
+        except msgspec.ValidationError as error:
+            if f"$.{key}" in str(error):
+                said = str(error).split(" - at ")[0]
+                raise UsageError(f"format {importer.name}: option {key}={value!r}: {said}") from None
+    try:
+        return msgspec.convert(dict(values), importer.Options, strict=False)
+    except msgspec.ValidationError as error:
+        raise UsageError(f"format {importer.name}: {error}") from None
+
+
+def recognise(path: Path) -> list[Candidate]:
+    """Return the formats that a file or folder may be, surest first; a folder as a whole, not what is in it.
+
+    Raises
+    ------
+    MarchaError
+        The file cannot be read.
+    """
+    head = _head(path)
+    found = []
+    for name, (importer, _) in importers().items():
+        try:
+            confidence = float(importer.sniff(head, path))
+        except Exception as error:  # a plug-in's fault must not stop the others
+            warnings.warn(f"importer {name} failed to look at {path}: {error!r}", stacklevel=2)
+            continue
+        if confidence >= CANDIDATE:
+            found.append(Candidate(name, min(confidence, 1.0)))
+    return sorted(found, key=lambda c: -c.confidence)
+
+
+def choose(
+    paths: Sequence[Path], format: str | None, stack: contextlib.ExitStack
+) -> tuple[Registered, list[Path]]:
+    """Find the importer of a source, and the files or folders to hand to it.
+
+    A folder is first offered whole, then its files; a zip archive is unpacked and taken for a folder.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        What the user gave.
+    format : str, optional
+        Name of the format; without it content decides.
+    stack : contextlib.ExitStack
+        Keeps unpacked archives until it is closed.
+
+    Raises
+    ------
+    MarchaError
+        Nothing there, unknown or ambiguous content, or several inputs that are not pieces of one recording.
+    """
+    if not paths:
+        raise UsageError("nothing to convert: give at least one file, folder or zip archive")
+    wanted = get(format) if format else None
+    chosen: list[tuple[str, Path]] = []
+    for path in paths:
+        chosen += _resolve(Path(path), wanted, stack)
+    names = sorted({name for name, _ in chosen})
+    if len(names) > 1:
+        pairs = ", ".join(f"{p.name} is {n}" for n, p in chosen[:4])
+        raise MarchaError(
+            f"{paths[0]}: the inputs are of different formats ({pairs}); convert them one by one"
+        )
+    registered = get(names[0])
+    files = [p for _, p in chosen]
+    if len(files) > 1 and not (getattr(registered.importer, "joins", False) and len(paths) > 1):
+        raise MarchaError(
+            f"{paths[0]}: {len(files)} recordings of format {names[0]} "
+            f"({', '.join(p.name for p in files[:3])} …); convert them one by one"
+        )
+    return registered, files
+
+
+def _resolve(path: Path, wanted: Registered | None, stack: contextlib.ExitStack) -> list[tuple[str, Path]]:
+    """Return (format, file or folder) of everything that one input holds."""
+    if not path.exists():
+        raise MarchaError(f"{path}: no such file or folder")
+    whole = _candidates(path, wanted)
+    if whole:
+        return [(whole[0].name, path)]
+    if path.is_dir():
+        folder = path
+    elif zipfile.is_zipfile(path):
+        folder = _unpack(path, stack)
+        if inner := _candidates(folder, wanted):
+            return [(inner[0].name, folder)]
+    else:
+        if wanted is not None:
+            return [(wanted.importer.name, path)]
+        if not path.stat().st_size:
+            raise MarchaError(f"{path}: the file is empty; nothing to convert")
+        raise MarchaError(f"{path}: unknown content; {_tried()}")
+    files = sorted(p for p in folder.rglob("*") if _is_data(p, folder))
+    if not files:
+        raise MarchaError(f"{path}: the {'folder' if path.is_dir() else 'archive'} holds no files")
+    inside = [(c[0].name, p) for p in files if (c := _candidates(p, wanted))]
+    if not inside and wanted is not None and len(files) == 1:
+        return [(wanted.importer.name, files[0])]
+    if not inside:
+        raise MarchaError(f"{path}: unknown content in all of its {len(files)} files; {_tried()}")
+    if len(inside) > 1:
+        some = ", ".join(f"{p.relative_to(folder)} ({n})" for n, p in inside[:4])
+        raise MarchaError(
+            f"{path}: holds {len(inside)} recordings: {some}{' …' if len(inside) > 4 else ''}; "
+            "convert them one by one"
+        )
+    return inside
+
+
+def _candidates(path: Path, wanted: Registered | None) -> list[Candidate]:
+    """Return the formats that fit; of several only a clear leader."""
+    found = recognise(path)
+    if wanted is not None:
+        return [c for c in found if c.name == wanted.importer.name]
+    if len(found) > 1 and found[0].confidence - found[1].confidence < LEAD:
+        listed = ", ".join(f"{c.name} ({c.confidence:.2f})" for c in found)
+        raise MarchaError(f"{path}: could be {listed}; say which with --format")
+    return found
+
+
+def _tried() -> str:
+    return f"tried {', '.join(importers())}; give --format, or --map with a TOML mapping of its columns"
+
+
+def _is_data(path: Path, folder: Path) -> bool:
+    hidden = any(part.startswith(".") or part == "__MACOSX" for part in path.relative_to(folder).parts)
+    return path.is_file() and not hidden and not is_side_file(path)
+
+
+def _head(path: Path) -> bytes:
+    if path.is_dir():
+        return b""
+    try:
+        with path.open("rb") as f:
+            return f.read(HEAD_BYTES)
+    except OSError as error:
+        raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _unpack(path: Path, stack: contextlib.ExitStack) -> Path:
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="marcha-")))
+    try:
+        with zipfile.ZipFile(path) as archive:
+            archive.extractall(folder)
+    except (zipfile.BadZipFile, zipfile.LargeZipFile, RuntimeError, NotImplementedError, EOFError) as error:
+        raise MarchaError(f"{path}: the zip archive cannot be unpacked: {error}") from error
+    except OSError as error:
+        raise MarchaError(f"{path}: cannot be unpacked: {error.strerror or error}") from error
+    return folder
+
+
+def _check(importer: Any) -> None:
+    for field in ("name", "title", "Options", "sniff", "read"):
+        if not hasattr(importer, field):
+            raise TypeError(f"it has no {field!r}")
+    if not issubclass(importer.Options, CommonOptions):
+        raise TypeError("its Options do not inherit from CommonOptions")
+
+
+def _distribution(point: EntryPoint) -> str:
+    return f"{point.dist.name} {point.dist.version}" if point.dist else "unknown"
+
+
+def _label(point: EntryPoint) -> str:
+    return f"{point.name!r} ({point.value}, {_distribution(point)})"
+
+
+def _info(registered: Registered) -> FormatInfo:
+    importer = registered.importer
+    hints = msgspec.inspect.type_info(importer.Options)
+    assert isinstance(hints, msgspec.inspect.StructType)
+    options = [
+        OptionInfo(f.name, _type_text(f.type), _default_text(f), _description(f.type)) for f in hints.fields
+    ]
+    doc = (importer.Options.__doc__ or "").strip().split("\n\n")[0]
+    return FormatInfo(
+        importer.name,
+        importer.title,
+        registered.source,
+        bool(getattr(importer, "joins", False)),
+        doc,
+        options,
+    )
+
+
+def _default_text(field: msgspec.inspect.Field) -> str:
+    if field.required:
+        return "required"
+    value = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+    return "" if value is None else str(value)
+
+
+def _description(kind: msgspec.inspect.Type) -> str:
+    extra = kind.extra_json_schema or {} if isinstance(kind, msgspec.inspect.Metadata) else {}
+    return str(extra.get("description", ""))
+
+
+def _type_text(kind: msgspec.inspect.Type) -> str:
+    if isinstance(kind, msgspec.inspect.Metadata):
+        return _type_text(kind.type)
+    if isinstance(kind, msgspec.inspect.UnionType):
+        return " or ".join(_type_text(t) for t in kind.types if not isinstance(t, msgspec.inspect.NoneType))
+    if isinstance(kind, msgspec.inspect.LiteralType):
+        return ", ".join(str(v) for v in sorted(kind.values))
+    words = {"StrType": "text", "IntType": "integer", "FloatType": "number", "BoolType": "true or false"}
+    return words.get(type(kind).__name__, type(kind).__name__.removesuffix("Type").lower())

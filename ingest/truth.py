@@ -1,0 +1,117 @@
+"""The truth of a simulated walk, in side files beside the raw log.
+
+``<stem>.truth.csv`` has ``t_ns`` on the device's unrolled clock, pose and velocity of sensor 1 and whether
+the foot is still; it becomes ``/reference/pose``, ``/reference/velocity`` and ``/reference/stance``.
+``<stem>.truth.imu2.csv`` has the same of sensor 2, for ``/reference/imu2/pose`` and so on.
+``<stem>.truth.toml`` holds facts (closed, length_m, scenario, seed …) for the metadata record ``truth``.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import polars as pl
+
+from ..recording.errors import MarchaError
+from .contract import ChannelSpec
+
+POSE = ("pos_x", "pos_y", "pos_z", "quat_w", "quat_x", "quat_y", "quat_z")
+VELOCITY = ("vel_x", "vel_y", "vel_z")
+
+SCHEMAS = (
+    ("pose", "geometry_msgs/msg/PoseStamped", POSE),
+    ("velocity", "geometry_msgs/msg/Vector3Stamped", VELOCITY),
+    ("stance", "marcha_msgs/msg/Stance", ("still",)),
+)
+
+
+class Truth(msgspec.Struct, frozen=True):
+    """Truth known about a walk.
+
+    Attributes
+    ----------
+    files : tuple of Path
+        Where it was read.
+    metadata : dict of str to str
+        ``closed``, ``length_m``, ``scenario``, ``seed`` …
+    tables : dict of ChannelSpec to polars.DataFrame
+        The reference channels.
+    """
+
+    files: tuple[Path, ...]
+    metadata: dict[str, str]
+    tables: list[tuple[ChannelSpec, pl.DataFrame]]
+
+
+def is_side_file(path: Path) -> bool:
+    """Whether a file is the truth of another one, not a recording."""
+    return bool(re.search(r"\.truth(\.\w+)?\.(csv|toml)$", path.name))
+
+
+def read_truth(path: Path) -> Truth | None:
+    """Read the truth beside a raw log; None where there is none.
+
+    Raises
+    ------
+    MarchaError
+        A side file is damaged.
+    """
+    facts_file = path.with_name(f"{path.stem}.truth.toml")
+    parts = {"": f"{path.stem}.truth.csv", "imu2/": f"{path.stem}.truth.imu2.csv"}
+    tables = []
+    files = []
+    for part, name in parts.items():
+        if (file := path.with_name(name)).is_file():
+            files.append(file)
+            table = _table(file)
+            tables += [
+                (ChannelSpec(f"/reference/{part}{what}", schema, "nav"), table.select("t_ns", *columns))
+                for what, schema, columns in SCHEMAS
+            ]
+    if facts_file.is_file():
+        files.append(facts_file)
+    if not files:
+        return None
+    return Truth(tuple(files), _facts(facts_file) if facts_file in files else {}, tables)
+
+
+def as_text(value: object) -> str:
+    """Return a fact as metadata text: ``true``/``false``, numbers in full."""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _facts(file: Path) -> dict[str, str]:
+    try:
+        facts = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise MarchaError(f"{file}: not a readable TOML file: {error}; repair or remove it") from error
+    return dict(_flat("", facts))
+
+
+def _flat(prefix: str, facts: dict[str, object]) -> Iterator[tuple[str, str]]:
+    for key, value in facts.items():
+        if isinstance(value, dict):
+            yield from _flat(f"{prefix}{key}.", value)
+        else:
+            yield f"{prefix}{key}", as_text(value)
+
+
+def _table(file: Path) -> pl.DataFrame:
+    columns = {"t_ns": pl.Int64, **dict.fromkeys((*POSE, *VELOCITY), pl.Float64), "still": pl.String}
+    try:
+        table = pl.read_csv(file, schema_overrides=columns)
+    except (OSError, pl.exceptions.PolarsError) as error:
+        raise MarchaError(f"{file}: not a readable truth table: {str(error).splitlines()[0]}") from error
+    missing = [c for c in columns if c not in table.columns]
+    if missing:
+        raise MarchaError(f"{file}: column {missing[0]} is missing; a truth table has {', '.join(columns)}")
+    table = table.select(
+        *(c for c in columns if c != "still"), still=pl.col("still").is_in(["1", "true", "True", "1.0"])
+    )
+    if table.null_count().sum_horizontal().item() or not table["t_ns"].is_sorted():
+        raise MarchaError(f"{file}: a truth table has no empty cells and its time never decreases")
+    return table
