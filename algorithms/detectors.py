@@ -72,6 +72,7 @@ from .layout import (
 FloatArray = NDArray[np.float64]
 
 KINDS = ("c1c2c3", "pitch", "shoe", "are", "mv", "mag")
+PITCH = KINDS.index("pitch")
 CLEANINGS = ("median", "fill-burst", "none")
 STATISTICS: dict[str, tuple[str, ...]] = {
     "c1c2c3": ("acc_norm", "acc_var", "gyr_norm"),
@@ -135,24 +136,26 @@ def track_tilt(s: FloatArray, r: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _variance(s: FloatArray, field: int, lo: int, hi: int) -> float:
+    base, mask = int(s[RING]) + field, int(s[RING_MASK])
     n = hi - lo + 1
     total = 0.0
     for i in range(lo, hi + 1):
-        total += s[record(s, i) + field]
+        total += s[base + (i & mask) * RECORD]
     mean = total / n
     total = 0.0
     for i in range(lo, hi + 1):
-        d = s[record(s, i) + field] - mean
+        d = s[base + (i & mask) * RECORD] - mean
         total += d * d
     return total / n
 
 
 @njit(cache=True, nogil=True)
 def _shoe(s: FloatArray, lo: int, hi: int) -> float:
+    base, mask = int(s[RING]), int(s[RING_MASK])
     n = hi - lo + 1
     mx, my, mz = 0.0, 0.0, 0.0
     for i in range(lo, hi + 1):
-        r = record(s, i) + R_ACC
+        r = base + (i & mask) * RECORD + R_ACC
         mx += s[r]
         my += s[r + 1]
         mz += s[r + 2]
@@ -163,7 +166,7 @@ def _shoe(s: FloatArray, lo: int, hi: int) -> float:
     mz *= k
     total = 0.0
     for i in range(lo, hi + 1):
-        r = record(s, i)
+        r = base + (i & mask) * RECORD
         x, y, z = s[r + R_ACC] - mx, s[r + R_ACC + 1] - my, s[r + R_ACC + 2] - mz
         w = s[r + R_NORM_GYR]
         total += (x * x + y * y + z * z) * s[WEIGHT_ACC] + w * w * s[WEIGHT_GYR]
@@ -172,10 +175,11 @@ def _shoe(s: FloatArray, lo: int, hi: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _moving_variance(s: FloatArray, lo: int, hi: int) -> float:
+    base, mask = int(s[RING]), int(s[RING_MASK])
     n = hi - lo + 1
     mx, my, mz = 0.0, 0.0, 0.0
     for i in range(lo, hi + 1):
-        r = record(s, i) + R_ACC
+        r = base + (i & mask) * RECORD + R_ACC
         mx += s[r]
         my += s[r + 1]
         mz += s[r + 2]
@@ -184,7 +188,7 @@ def _moving_variance(s: FloatArray, lo: int, hi: int) -> float:
     mz /= n
     total = 0.0
     for i in range(lo, hi + 1):
-        r = record(s, i) + R_ACC
+        r = base + (i & mask) * RECORD + R_ACC
         x, y, z = s[r] - mx, s[r + 1] - my, s[r + 2] - mz
         total += x * x + y * y + z * z
     return total / n
@@ -192,9 +196,10 @@ def _moving_variance(s: FloatArray, lo: int, hi: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _energy(s: FloatArray, field: int, level: float, lo: int, hi: int) -> float:
+    base, mask = int(s[RING]) + field, int(s[RING_MASK])
     total = 0.0
     for i in range(lo, hi + 1):
-        d = s[record(s, i) + field] - level
+        d = s[base + (i & mask) * RECORD] - level
         total += d * d
     return total / (hi - lo + 1)
 
@@ -280,9 +285,10 @@ def decide(s: FloatArray, k: int, last: int) -> None:
         if 0 <= j <= last:
             lo = max(0, j - int(s[C_LO]))
             hi = min(last, j + int(s[C_HI]))
+            base, mask = int(s[RING]) + R_RAW, int(s[RING_MASK])
             ones = 0.0
             for i in range(lo, hi + 1):
-                ones += s[record(s, i) + R_RAW]
+                ones += s[base + (i & mask) * RECORD]
             s[record(s, j) + R_STILL] = 1.0 if 2.0 * ones > hi - lo + 1 else 0.0
     elif cleaning == 1:
         j -= int(s[C_LEN]) - 1

@@ -17,10 +17,11 @@ from numba import njit
 from . import detectors, strapdown
 from . import layout as la
 from .contract import AlgorithmError, FloatArray, Input, KernelEstimator, Output, Remark
-from .detectors import decide, record, start_tilt, track_tilt
+from .detectors import PITCH, decide, record, start_tilt, track_tilt
 from .layout import (
     C_HI,
     INIT_INDEX,
+    KIND,
     LATENCY,
     O_POSE,
     O_REST,
@@ -238,10 +239,10 @@ def take(s: FloatArray, row: FloatArray) -> bool:
     s[r + R_NORM_GYR] = math.sqrt(x * x + y * y + z * z)
     if strapdown.watch_rest(s, r, k):
         start_tilt(s)
-    if s[INIT_INDEX] >= 0.0:
-        track_tilt(s, r)
-    else:
+    if s[INIT_INDEX] < 0.0:
         s[r + R_PITCH] = math.nan
+    elif s[KIND] == PITCH:
+        track_tilt(s, r)
     decide(s, k, k)
     return k >= int(s[LATENCY])
 
