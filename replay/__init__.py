@@ -1,1 +1,45 @@
-"""To be written."""
+"""From a recording to estimates: ordering, pacing, the engine, results with lineage, metrics."""
+
+from .alignment import ALIGNMENTS, align
+from .api import replay
+from .clock import Clock, ManualClock, SystemClock
+from .engine import Engine, ReplayResult, Run
+from .evaluate import Evaluation, RunEvaluation, check_thresholds, evaluate
+from .feed import GapPolicy
+from .metrics import RunView, Truth, nees_bounds
+from .plan import EstimatorSpec, Plan, PlannedRun, parse_estimator, plan_runs
+from .sinks import RecordingSink, Sink, TableSink
+from .sources import Batch, LiveSource, PlannedChannel, RecordingSource, Source
+
+__all__ = [
+    "ALIGNMENTS",
+    "Batch",
+    "Clock",
+    "Engine",
+    "EstimatorSpec",
+    "Evaluation",
+    "GapPolicy",
+    "LiveSource",
+    "ManualClock",
+    "Plan",
+    "PlannedChannel",
+    "PlannedRun",
+    "RecordingSink",
+    "RecordingSource",
+    "ReplayResult",
+    "Run",
+    "RunEvaluation",
+    "RunView",
+    "Sink",
+    "Source",
+    "SystemClock",
+    "TableSink",
+    "Truth",
+    "align",
+    "check_thresholds",
+    "evaluate",
+    "nees_bounds",
+    "parse_estimator",
+    "plan_runs",
+    "replay",
+]

@@ -1,0 +1,168 @@
+"""``replay``: a recording through estimators in one call."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from ..algorithms.contract import Estimator
+from ..recording import Recording
+from ..recording.errors import OutputExists, UsageError
+from .clock import Clock
+from .engine import Engine, Progress, ReplayResult, Run
+from .evaluate import evaluate_run, recording_view
+from .feed import GapPolicy
+from .plan import EstimatorSpec, plan_runs
+from .sinks import RecordingSink, Sink, TableSink
+from .sources import RecordingSource, Source
+
+
+def replay(
+    recording: Recording | Source,
+    estimators: Sequence[str | EstimatorSpec | Estimator | type],
+    params: Mapping[str, Any] | None = None,
+    *,
+    inputs: Sequence[str] | None = None,
+    speed: float | str = "max",
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+    out: Path | str | None = None,
+    overwrite: bool = False,
+    mode: Literal["block", "sample"] = "block",
+    gap: GapPolicy | str | None = None,
+    sinks: Sequence[Sink] = (),
+    keep_tables: bool = True,
+    clock: Clock | None = None,
+    progress: Progress | None = None,
+    max_rows: int = 65_536,
+) -> ReplayResult:
+    """Feed a recording (or a live source) to estimators, as if it happened now, and keep what they say.
+
+    Parameters
+    ----------
+    recording : Recording or Source
+        As :func:`marcha.recording.open` gives it; or a :class:`LiveSource`.
+    estimators : sequence
+        Names (``foot.9iez``, ``slow=foot.9iez[sigma_acc=0.01]``), or classes or instances of one's own. All run in
+        one pass.
+    params : mapping, optional
+        Parameters for every estimator that has them; those in the brackets of a name win.
+    inputs : sequence of str, optional
+        Topics to attach to; without it every raw channel of an estimator's kind, one run each.
+    speed : "max" or float
+        Factor of real time. The results have the same bits at any speed.
+    start_ns, end_ns : int, optional
+        Range of log times, half open.
+    out : path, optional
+        Recording to write: all that was in the input, the estimates, stance and step annotations, lineage.
+    overwrite : bool
+        Whether ``out`` may be replaced.
+    mode : {"block", "sample"}
+        Whole blocks through the estimators that take them, or one step a sample. Same bits.
+    gap : GapPolicy or str
+        What happens when the first input of an estimator pauses: ``bridge`` (default), ``reset`` or ``stop``.
+    sinks : sequence of Sink
+        Further observers: a viewer, a file, a test.
+    keep_tables : bool
+        Keep the results in memory (``result.runs[i].tables``). Without it memory does not grow with the length,
+        and metrics are measured only where ``out`` is given (from there).
+    clock : Clock, optional
+        Paces the replay.
+    progress : callable, optional
+        Called with nanoseconds done and in all.
+    max_rows : int
+        Rows of a block.
+
+    Returns
+    -------
+    ReplayResult
+
+    Raises
+    ------
+    UsageError
+        Unknown names, parameters or topics; a missing column; ``out`` is the input.
+    OutputExists
+        ``out`` is there and ``overwrite`` is false.
+    """
+    rec = recording if isinstance(recording, Recording) else None
+    source: Source = RecordingSource(rec, max_rows) if rec is not None else recording  # type: ignore[assignment]
+    target = Path(out) if out is not None else None
+    if target is not None:
+        if rec is not None and target.exists() and os.path.samefile(target, rec.path):
+            raise UsageError(
+                f"{target}: is the input itself; a recording is never changed in place, give another name"
+            )
+        if target.exists() and not overwrite:
+            raise OutputExists(target)
+    taken = [n.removeprefix("run/") for n in rec.metadata if n.startswith("run/")] if rec is not None else []
+    taken += {t.split("/")[2] for t in source.channels if t.startswith("/estimate/") and t.count("/") > 2}
+    runs = plan_runs(source, estimators, params, inputs, taken)
+    tables = TableSink() if keep_tables else None
+    own: list[Sink] = [
+        s for s in (tables, RecordingSink(target, rec, overwrite) if target else None) if s is not None
+    ]
+    digest = _Digest(Path(rec.path)) if rec is not None and target is not None else None
+
+    def complete(done: list[Run]) -> None:
+        for run in done:
+            run.lineage["input_recording"] = source.name
+            if digest is not None:
+                run.lineage["input_blake2b"] = digest.result()
+            if tables is not None:
+                kept = {name: tables.table(topic) for name, topic in run.outputs.items()}
+                run.tables = {name: t for name, t in kept.items() if t is not None}
+                view = recording_view(rec, run.lineage, run.tables, start_ns, end_ns)
+                run.metrics = evaluate_run(view).metrics
+
+    engine = Engine(
+        source,
+        runs,
+        sinks=(*own, *sinks),
+        mode=mode,
+        speed=speed,
+        gap=GapPolicy(gap) if isinstance(gap, str) else gap,  # type: ignore[arg-type]
+        clock=clock,
+        start_ns=start_ns,
+        end_ns=end_ns,
+        checkpoint_s=None,
+        progress=progress,
+    )
+    with engine:
+        engine.play()
+        result = engine.finish(complete)
+    if target is not None and tables is None:
+        from ..recording import open as open_recording
+        from .evaluate import evaluate
+
+        measured = {r.run: r.metrics for r in evaluate(open_recording(target)).runs}
+        for run in result.runs:
+            run.metrics = measured.get(run.run, {})
+    return result
+
+
+class _Digest:
+    """BLAKE2b of a file, worked out beside the replay."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._result: str | BaseException = ""
+        self._thread = threading.Thread(target=self._run, daemon=True, name="digest")
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            with self._path.open("rb") as file:
+                self._result = hashlib.file_digest(file, "blake2b").hexdigest()
+        except BaseException as error:  # raised where the result is asked for
+            self._result = error
+
+    def result(self) -> str:
+        """Wait for it."""
+        self._thread.join()
+        if isinstance(self._result, BaseException):
+            raise self._result
+        return self._result

@@ -1,0 +1,335 @@
+"""How good the estimates of a recording are: every metric, overall and per annotated interval."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Mapping
+
+import msgspec
+import polars as pl
+
+from ..recording import Recording
+from ..recording.errors import MarchaError, UsageError
+from .metrics import RunView, Truth, available_metrics
+
+OWN_TIERS = ("stance", "step")
+"""Tiers that a replay itself writes, as ``<run>/<tier>``."""
+
+
+class IntervalEvaluation(msgspec.Struct):
+    """Metrics of one annotated interval.
+
+    Attributes
+    ----------
+    tier, label : str
+        The annotation.
+    start_ns, end_ns : int
+        Its times, half open.
+    metrics : dict of str to float
+        As overall, but those that need the whole walk.
+    matched, dropped : int
+        As overall.
+    """
+
+    tier: str
+    label: str
+    start_ns: int
+    end_ns: int
+    metrics: dict[str, float]
+    matched: int
+    dropped: int
+
+
+class RunEvaluation(msgspec.Struct):
+    """Metrics of one run.
+
+    Attributes
+    ----------
+    run, estimator, input : str
+        Id, name, topic of the first input.
+    metrics : dict of str to float
+        Empty where the run's results must not be used.
+    matched, dropped : int
+        Samples that were compared with the reference, and those that have no partner there.
+    max_time_difference_s : float
+        Largest distance in time between a compared sample and the nearest one of the other track.
+    alignment : str
+        Which alignment the errors are after; empty without a reference.
+    time_base : str
+        ``estimate`` or ``reference``: at whose stamps they were compared; empty without a reference.
+    note : str
+        Why there are no metrics.
+    intervals : list of IntervalEvaluation
+        Per annotated interval.
+    """
+
+    run: str
+    estimator: str
+    input: str
+    metrics: dict[str, float] = {}
+    matched: int = 0
+    dropped: int = 0
+    max_time_difference_s: float = 0.0
+    alignment: str = ""
+    time_base: str = ""
+    note: str = ""
+    intervals: list[IntervalEvaluation] = []
+
+
+class Evaluation(msgspec.Struct):
+    """Metrics of every run of a recording.
+
+    Attributes
+    ----------
+    runs : list of RunEvaluation
+        In the order of the recording.
+    """
+
+    runs: list[RunEvaluation]
+
+
+class Missed(msgspec.Struct, frozen=True):
+    """A bound that a run broke: ``value`` is None where the run does not have the metric."""
+
+    run: str
+    metric: str
+    value: float | None
+    bound: float
+    kind: str
+
+
+def evaluate(
+    rec: Recording,
+    *,
+    runs: list[str] | None = None,
+    alignment: str = "se3",
+    max_gap_s: float = 0.1,
+    reference: str | None = None,
+    intervals: bool = True,
+) -> Evaluation:
+    """Measure every run of a replayed recording.
+
+    Parameters
+    ----------
+    rec : Recording
+        With estimates, as :func:`replay` writes it.
+    runs : list of str, optional
+        Ids; all without it.
+    alignment : {"none", "origin", "origin-yaw", "se2", "se3"}
+        How a track is laid upon the reference; see :func:`marcha.replay.alignment.align`.
+    max_gap_s : float
+        Reference samples farther apart are not interpolated between.
+    reference : str, optional
+        Topic of the reference track. Without it the one named like the run's input (``/reference/imu2/pose`` for
+        ``/foot/imu2``), else ``/reference/pose``, else the only pose below ``/reference/``.
+    intervals : bool
+        Whether annotated intervals are measured too.
+
+    Returns
+    -------
+    Evaluation
+
+    Raises
+    ------
+    MarchaError
+        Where the recording has no estimates.
+    UsageError
+        An unknown run, alignment or reference.
+    """
+    lineages = {n.removeprefix("run/"): m for n, m in rec.metadata.items() if n.startswith("run/")}
+    for topic in rec.channels:  # estimates of others' tools have no record
+        if topic.startswith("/estimate/") and topic.count("/") > 2:
+            lineages.setdefault(topic.split("/")[2], {})
+    if not lineages:
+        raise MarchaError(f"{rec.path}: has no estimates; run `marcha replay` first")
+    for run in runs or ():
+        if run not in lineages:
+            raise UsageError(f"{rec.path}: no run {run}; there are {', '.join(lineages)}")
+    views = [
+        recording_view(
+            rec, {"run": run, **lineage}, None, alignment=alignment, max_gap_s=max_gap_s, reference=reference
+        )
+        for run, lineage in lineages.items()
+        if runs is None or run in runs
+    ]
+    marked = _intervals(rec.annotations) if intervals else pl.DataFrame()
+    return Evaluation([evaluate_run(view, marked) for view in views])
+
+
+def recording_view(
+    rec: Recording | None,
+    lineage: Mapping[str, str],
+    tables: Mapping[str, pl.DataFrame] | None,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+    *,
+    alignment: str = "se3",
+    max_gap_s: float = 0.1,
+    reference: str | None = None,
+) -> RunView:
+    """Return what the metrics of one run look at: its tables in memory, or those of the recording.
+
+    Parameters
+    ----------
+    rec : Recording or None
+        Holds the reference, the truth, and the estimates where ``tables`` is None.
+    lineage : mapping
+        The record ``run/<id>``.
+    tables : mapping or None
+        Results by output.
+    start_ns, end_ns : int, optional
+        Range of the replay; a walk's length says nothing of a part of it.
+    alignment, max_gap_s, reference
+        As in :func:`evaluate`.
+    """
+    run = lineage["run"]
+
+    def output(name: str) -> pl.DataFrame | None:
+        if tables is not None:
+            return tables.get(name)
+        topic = f"/estimate/{run}/{name}"
+        return rec.table(topic) if rec is not None and topic in rec.channels else None
+
+    start_ns = start_ns if start_ns is not None else _number(lineage.get("range.start_ns"))
+    end_ns = end_ns if end_ns is not None else _number(lineage.get("range.end_ns"))
+    whole = start_ns is None and end_ns is None
+    pose = _reference_topic(rec, lineage.get("input", ""), reference) if rec is not None else None
+    velocity = None if pose is None else pose.rpartition("/")[0] + "/velocity"
+    return RunView(
+        run=run,
+        estimator=lineage.get("estimator", ""),
+        lineage=lineage,
+        output=output,
+        truth=truth_of(rec.metadata) if rec is not None and whole else Truth(),
+        reference=rec.table(pose) if rec is not None and pose is not None else None,
+        reference_velocity=rec.table(velocity) if rec is not None and velocity in rec.channels else None,
+        alignment=alignment,
+        max_gap_s=max_gap_s,
+    )
+
+
+def evaluate_run(view: RunView, intervals: pl.DataFrame | None = None) -> RunEvaluation:
+    """Measure one run; a run that is fatal or was restarted in between is said so, not measured.
+
+    Parameters
+    ----------
+    view : RunView
+        The run.
+    intervals : polars.DataFrame, optional
+        Annotated intervals (``tier, start_ns, end_ns, label``) to measure as well.
+    """
+    done = RunEvaluation(view.run, view.estimator, view.lineage.get("input", ""))
+    if view.lineage.get("fatal") == "true":
+        details = [d for _, _, d in json.loads(view.lineage.get("findings", "[]"))]
+        done.note = f"results must not be used: {details[-1] if details else 'see the findings'}"
+        return done
+    if int(view.lineage.get("segments", 1)) > 1:
+        done.note = "the estimator was restarted at gaps (policy reset): segments do not share an origin"
+        return done
+    done.metrics = _measure(view)
+    if "loop_s" in view.lineage:
+        done.metrics["run_time_s"] = float(view.lineage["loop_s"])
+    done.matched, done.dropped = _matched(view)
+    if view.comparison is not None:
+        done.alignment = view.alignment
+        done.time_base = "estimate" if view.comparison.on_estimate else "reference"
+        done.max_time_difference_s = view.comparison.matches.max_distance_s
+    for row in intervals.iter_rows(named=True) if intervals is not None else ():
+        part = view.interval(row["start_ns"], row["end_ns"])
+        done.intervals.append(
+            IntervalEvaluation(
+                row["tier"], row["label"], row["start_ns"], row["end_ns"], _measure(part), *_matched(part)
+            )
+        )
+    return done
+
+
+def check_thresholds(
+    evaluation: Evaluation,
+    maximum: Mapping[str, float] | None = None,
+    minimum: Mapping[str, float] | None = None,
+) -> list[Missed]:
+    """Return every bound that a run breaks. A run without the metric, or with NaN, breaks it.
+
+    Raises
+    ------
+    UsageError
+        A metric that no run has: a misspelt bound must not pass.
+    """
+    known = list(dict.fromkeys(m for r in evaluation.runs for m in r.metrics))
+    missed = []
+    for kind, bounds in (("max", maximum or {}), ("min", minimum or {})):
+        for metric, bound in bounds.items():
+            if metric not in known:
+                raise UsageError(
+                    f"--{kind} {metric}: no run has this metric; there are {', '.join(known) or 'none'}"
+                )
+            for run in evaluation.runs:
+                value = run.metrics.get(metric)
+                if value is None or not (value <= bound if kind == "max" else value >= bound):
+                    missed.append(Missed(run.run, metric, value, bound, kind))
+    return missed
+
+
+def truth_of(records: Mapping[str, Mapping[str, str]]) -> Truth:
+    """Return what a recording's metadata record ``truth`` knows of the walk."""
+    record = records.get("truth", {})
+    closed = record.get("closed", "").lower()
+    try:
+        length = float(record["length_m"]) if record.get("length_m") else None
+    except ValueError:
+        raise MarchaError(f"metadata record truth: length_m {record['length_m']!r} is no number") from None
+    return Truth({"true": True, "false": False}.get(closed), length)
+
+
+def _measure(view: RunView) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for name, metric in available_metrics().items():
+        try:
+            found |= {k: float(v) for k, v in metric(view).items()}
+        except MarchaError:
+            raise
+        except Exception as error:
+            if (getattr(metric, "__module__", "") or "").startswith("marcha."):
+                raise
+            warnings.warn(f"metric plug-in {name} failed on run {view.run}: {error}", stacklevel=2)
+    return found
+
+
+def _matched(view: RunView) -> tuple[int, int]:
+    compared = view.comparison
+    if compared is None:
+        return 0, len(view.track) if view.track is not None and view.reference is not None else 0
+    return len(compared.matches.index), compared.matches.dropped
+
+
+def _intervals(annotations: pl.DataFrame) -> pl.DataFrame:
+    """Return the annotations that are intervals and that no replay wrote."""
+    own = pl.col("tier").str.contains(rf"/(?:{'|'.join(OWN_TIERS)})$")
+    return annotations.filter((pl.col("end_ns") > pl.col("start_ns")) & ~own)
+
+
+def _reference_topic(rec: Recording, input_topic: str, chosen: str | None) -> str | None:
+    """Return the reference of an input: of ``/foot/imu2``, ``/reference/imu2/pose`` before ``/reference/pose``."""
+    poses = [
+        t
+        for t, c in rec.channels.items()
+        if t.startswith("/reference/") and c.schema == "geometry_msgs/msg/PoseStamped"
+    ]
+    if chosen is not None:
+        if chosen not in poses:
+            raise UsageError(f"{rec.path}: no reference {chosen}; there are {', '.join(poses) or 'none'}")
+        return chosen
+    parts = [p for p in input_topic.split("/") if p]
+    for i in range(len(parts) + 1):
+        own = "/".join(("", "reference", *parts[i:], "pose"))
+        if own in poses:
+            return own
+    if len(poses) > 1:
+        raise UsageError(f"{rec.path}: several references ({', '.join(poses)}) for {input_topic}; name one")
+    return poses[0] if poses else None
+
+
+def _number(text: str | None) -> int | None:
+    return int(text) if text else None

@@ -1,0 +1,309 @@
+"""One run: an estimator that takes rows and gives tables."""
+
+from __future__ import annotations
+
+import copy
+import time
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import polars as pl
+
+from ..algorithms.contract import FloatArray, KernelEstimator, input_columns, output_columns
+from ..recording.errors import Finding, MarchaError
+from .feed import Feed, IntArray, Rows
+from .plan import PlannedRun
+
+
+@dataclass
+class _State:
+    """What a run remembers between two parts, beside the estimator's own state."""
+
+    recent_ns: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+    last_log_ns: int = 0
+    samples: int = 0
+    still_since: int | None = None
+    still_until: int = 0
+    stances: int = 0
+    steps: int = 0
+
+
+class Runner:
+    """Drives one estimator and names the time of each of its results.
+
+    Parameters
+    ----------
+    plan : PlannedRun
+        The estimator, its channels and parameters.
+    feed : Feed
+        Where its rows come from.
+    blocks : bool
+        Hand over whole blocks to estimators that take them (``run_block``), else one step a sample.
+    """
+
+    def __init__(self, plan: PlannedRun, feed: Feed, blocks: bool) -> None:
+        self.plan = plan
+        self.feed = feed
+        self.estimator: Any = plan.estimator
+        self.columns = output_columns(plan.estimator)
+        self.latency = plan.latency
+        self.blocks = blocks and hasattr(self.estimator, "run_block")
+        self.loop_s = 0.0
+        self._stance: list[tuple[int, int]] = []
+        self._steps: list[tuple[int, int, dict[str, str]]] = []
+        self._state = _State()
+        self._compile()
+        self._fresh = self._estimator_snapshot()
+        self._rows: list[tuple[FloatArray, IntArray]] = []  # of an offline estimator, the present segment
+
+    def _compile(self) -> None:
+        """Let a kernel compile (or load from its cache) before the clock of ``loop_s`` runs."""
+        width = len(input_columns(self.estimator))
+        if self.blocks:
+            self.estimator.run_block(np.empty((0, width)), np.empty((0, len(self.columns))))
+        elif isinstance(self.estimator, KernelEstimator):
+            before = self.estimator.snapshot()
+            self.estimator.step(np.zeros(width))
+            self.estimator.restore(before)
+
+    # -- state ---------------------------------------------------------------------------------------
+
+    def _estimator_snapshot(self) -> Any:
+        if hasattr(self.estimator, "snapshot"):
+            return self.estimator.snapshot()
+        return copy.deepcopy(self.estimator.__dict__)
+
+    def _restore_estimator(self, snapshot: Any) -> None:
+        if hasattr(self.estimator, "restore"):
+            self.estimator.restore(snapshot)
+        else:
+            self.estimator.__dict__.clear()
+            self.estimator.__dict__.update(copy.deepcopy(snapshot))
+
+    def snapshot(self) -> Any:
+        """Return a copy of everything that later results depend on."""
+        return (
+            self._estimator_snapshot(),
+            copy.copy(self._state),
+            len(self._stance),
+            len(self._steps),
+            list(self._rows),
+        )
+
+    def restore(self, snapshot: Any) -> None:
+        """Go back to ``snapshot``."""
+        estimator, state, stances, steps, rows = snapshot
+        self._restore_estimator(estimator)
+        self._state = copy.copy(state)
+        del self._stance[stances:], self._steps[steps:]
+        self._rows = list(rows)
+
+    # -- rows in, tables out -------------------------------------------------------------------------
+
+    def take(self, rows: Rows) -> dict[str, pl.DataFrame]:
+        """Feed rows; return a table of every output that has something to say."""
+        tables: list[dict[str, pl.DataFrame]] = []
+        bounds = [0, *rows.resets, len(rows)]
+        for k, (a, b) in enumerate(pairwise(bounds)):
+            if k and self._state.samples:
+                tables.append(self._restart())
+            if b > a:
+                tables.append(self._segment(rows.values[a:b], rows.t_ns[a:b], rows.t_log_ns[a:b]))
+        return _joined(tables)
+
+    def finish(self, end_ns: int) -> dict[str, pl.DataFrame]:
+        """Return the results that the estimator still holds; ``end_ns`` is the log time of an offline one."""
+        if self.plan.offline:
+            self._state.last_log_ns = max(self._state.last_log_ns, end_ns)
+        tables = self._flush()
+        self._close_stance()
+        return tables
+
+    def _restart(self) -> dict[str, pl.DataFrame]:
+        tables = self._flush()
+        self._close_stance()
+        self._restore_estimator(self._fresh)
+        self._state.recent_ns = np.empty(0, np.int64)
+        return tables
+
+    def _segment(self, values: FloatArray, t_ns: IntArray, t_log_ns: IntArray) -> dict[str, pl.DataFrame]:
+        state = self._state
+        state.samples += len(t_ns)
+        state.last_log_ns = int(t_log_ns[-1])
+        if self.plan.offline:
+            self._rows.append((values, t_ns))
+            return {}
+        out = np.full((len(t_ns), len(self.columns)), np.nan)
+        begin = time.perf_counter()
+        if self.blocks:
+            self.estimator.run_block(values, out)
+        else:
+            step = self.estimator.step
+            for i, row in enumerate(values):
+                result = step(row)
+                if result is not None:
+                    out[i] = result
+        self.loop_s += time.perf_counter() - begin
+        times = t_ns
+        if self.latency:
+            known = np.concatenate((state.recent_ns, t_ns))
+            state.recent_ns = known[-self.latency :]
+            early = self.latency - (len(known) - len(t_ns))  # rows whose result would speak of none
+            if early > 0:
+                if not np.isnan(out[:early]).all():
+                    raise MarchaError(
+                        f"estimator {self.plan.name} gave a result within its first {self.latency} rows, "
+                        f"its declared latency: the result would have no time"
+                    )
+                out, t_log_ns = out[early:], t_log_ns[early:]
+            times = known[: len(known) - self.latency] if len(known) > self.latency else known[:0]
+            times = times[len(times) - len(out) :]
+        return self._tables(out, times, t_log_ns)
+
+    def _flush(self) -> dict[str, pl.DataFrame]:
+        state = self._state
+        if self.plan.offline:
+            if not self._rows:
+                return {}
+            values = np.concatenate([v for v, _ in self._rows])
+            times = np.concatenate([t for _, t in self._rows])
+            self._rows = []
+            begin = time.perf_counter()
+            out = np.asarray(self.estimator.process(values), dtype=np.float64)
+            self.loop_s += time.perf_counter() - begin
+        else:
+            if not self.latency or not hasattr(self.estimator, "flush"):
+                return {}
+            out = np.asarray(self.estimator.flush(), dtype=np.float64)
+            times = state.recent_ns[len(state.recent_ns) - len(out) :]
+        if out.shape != (len(times), len(self.columns)):
+            raise MarchaError(
+                f"estimator {self.plan.name} returned {out.shape} at its end, expected ({len(times)}, {len(self.columns)})"
+            )
+        return self._tables(out, times, np.full(len(times), state.last_log_ns))
+
+    def _tables(self, out: FloatArray, t_ns: IntArray, t_log_ns: IntArray) -> dict[str, pl.DataFrame]:
+        tables: dict[str, pl.DataFrame] = {}
+        columns = np.ascontiguousarray(out.T)
+        first = 0
+        for output in self.estimator.outputs:
+            block = columns[first : first + len(output.columns)]
+            first += len(output.columns)
+            spoken = ~np.isnan(block[0]) if output.event else ~np.isnan(block).all(axis=0)
+            if not spoken.any():
+                continue
+            all_of_it = bool(spoken.all())
+            pick = slice(None) if all_of_it else spoken
+            data = {"t_ns": t_ns[pick], "t_log_ns": t_log_ns[pick]}
+            data |= {name: block[i][pick] for i, name in enumerate(output.columns)}
+            tables[output.name] = self._typed(output.name, pl.DataFrame(data))
+        return tables
+
+    def _typed(self, name: str, table: pl.DataFrame) -> pl.DataFrame:
+        """Give a table the schema's types and take down stances and steps."""
+        schema = self.plan.outputs[name].schema
+        if schema == "marcha_msgs/msg/Stance":
+            table = table.with_columns(pl.col("still") > 0.5)
+            self._note_stances(table["t_ns"].to_numpy(), table["still"].to_numpy())
+        elif schema == "marcha_msgs/msg/Step":
+            swing_ns = (pl.col("swing_s") * 1e9).round().cast(pl.Int64)
+            table = table.select(
+                "t_ns",
+                "t_log_ns",
+                (pl.col("t_ns") - swing_ns).alias("start_ns"),
+                pl.col("t_ns").alias("end_ns"),
+                *(c for c in table.columns[2:] if c != "swing_s"),
+            ).with_columns(pl.col("index").cast(pl.UInt32))
+            self._note_steps(table)
+        return table
+
+    # -- annotations ---------------------------------------------------------------------------------
+
+    def _note_stances(self, t_ns: IntArray, still: np.ndarray) -> None:
+        """Join still samples to intervals: first still sample to first moving one."""
+        state = self._state
+        before = state.still_since is not None
+        edges = np.flatnonzero(np.diff(still.astype(np.int8), prepend=np.int8(before)))
+        for edge in edges.tolist():
+            if state.still_since is None:
+                state.still_since = int(t_ns[edge])
+            else:
+                self._stance.append((state.still_since, int(t_ns[edge])))
+                state.still_since = None
+        state.still_until = int(t_ns[-1])
+
+    def _close_stance(self) -> None:
+        state = self._state
+        if state.still_since is not None:
+            self._stance.append((state.still_since, state.still_until))
+            state.still_since = None
+
+    def _note_steps(self, table: pl.DataFrame) -> None:
+        about = [c for c in table.columns if c not in ("t_ns", "t_log_ns", "start_ns", "end_ns")]
+        for row in table.iter_rows(named=True):
+            values = {c: f"{row[c]:.6g}" for c in about}
+            self._steps.append((int(row["start_ns"]), int(row["end_ns"]), values))
+
+    def annotation_table(self) -> pl.DataFrame:
+        """Return stances and steps as annotations of the tiers ``<run>/stance`` and ``<run>/step``."""
+        run = self.plan.run
+        rows = [(f"{run}/stance", a, b, "stance", {}) for a, b in self._stance]
+        rows += [
+            (f"{run}/step", a, b, f"step {v.get('index', i)}", v) for i, (a, b, v) in enumerate(self._steps)
+        ]
+        return annotations(rows)
+
+    # -- what to say -----------------------------------------------------------------------------------
+
+    @property
+    def samples(self) -> int:
+        """Rows that the estimator was fed."""
+        return self._state.samples
+
+    def findings(self) -> tuple[list[Finding], bool]:
+        """Return what the user must know about the run, and whether its results must not be used."""
+        found = [*self.plan.findings, *self.feed.findings()]
+        fatal = False
+        if not self.samples:
+            columns = " ".join(self.plan.inputs[0][1])
+            found.append(
+                Finding(
+                    "no_samples",
+                    1,
+                    None,
+                    f"{self.plan.input}: no message with a finite value in each of {columns}: nothing was computed",
+                )
+            )
+            fatal = True
+        for remark in self.estimator.remarks() if hasattr(self.estimator, "remarks") else ():
+            found.append(Finding(remark.kind, 1, None, remark.detail))
+            fatal |= remark.fatal
+        return found, fatal
+
+
+ANNOTATION_SCHEMA = {
+    "tier": pl.String,
+    "start_ns": pl.Int64,
+    "end_ns": pl.Int64,
+    "label": pl.String,
+    "metadata": pl.String,
+}
+
+
+def annotations(rows: list[tuple[str, int, int, str, dict[str, str]]]) -> pl.DataFrame:
+    """Return annotation rows as the table that :meth:`Writer.add_annotations` takes."""
+    import json
+
+    return pl.DataFrame(
+        [(*r[:4], json.dumps(r[4])) for r in rows], schema=ANNOTATION_SCHEMA, orient="row"
+    ).sort("start_ns", maintain_order=True)
+
+
+def _joined(tables: list[dict[str, pl.DataFrame]]) -> dict[str, pl.DataFrame]:
+    """Put the tables of consecutive stretches together, by output."""
+    if len(tables) == 1:
+        return tables[0]
+    names = dict.fromkeys(n for t in tables for n in t)
+    return {n: pl.concat([t[n] for t in tables if n in t]) for n in names}

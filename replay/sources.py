@@ -1,0 +1,280 @@
+"""Where messages come from: a recording, or something live.
+
+A source hands over windows: for every topic a table with ``t_ns`` (the time a message speaks of), ``t_log_ns``
+(when it was known) and its columns. Windows are disjoint in log time, so whatever merges one window merges all.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import polars as pl
+
+from ..recording.errors import MarchaError, UsageError
+
+if TYPE_CHECKING:
+    from ..recording import Recording
+
+RATE_ROWS = 20_000
+"""Intervals from which a channel's rate is measured: its first ones, so that a range or a seek changes nothing."""
+
+
+@dataclass(frozen=True)
+class PlannedChannel:
+    """One channel that a source has or that a run will write.
+
+    Attributes
+    ----------
+    topic, schema, frame_id : str
+        As in the recording.
+    columns : tuple of str
+        Columns beside the times.
+    metadata : dict of str to str
+        The channel's metadata.
+    run : str
+        Id of the run that writes it; empty for a channel of the source.
+    """
+
+    topic: str
+    schema: str
+    frame_id: str = ""
+    columns: tuple[str, ...] = ()
+    metadata: Mapping[str, str] = field(default_factory=dict)
+    run: str = ""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Messages of all topics between two log times.
+
+    Attributes
+    ----------
+    end_ns : int
+        All messages logged before this time have come once the batch is through (exclusive).
+    tables : dict of str to polars.DataFrame
+        ``t_ns``, ``t_log_ns`` and columns by topic, in channel order; log time never decreases.
+    """
+
+    end_ns: int
+    tables: dict[str, pl.DataFrame]
+
+
+class Source(Protocol):
+    """What the engine asks of a source."""
+
+    name: str
+    channels: Mapping[str, PlannedChannel]
+    seekable: bool
+    start_ns: int
+    end_ns: int
+
+    def rate_hz(self, topic: str) -> float:
+        """Return the channel's measured or declared rate in hertz, 0 where it is not known."""
+        ...
+
+    def batches(
+        self, topics: Sequence[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Batch]:
+        """Yield batches of these topics, log time in [start_ns, end_ns)."""
+        ...
+
+
+def measured_rate(t_ns: np.ndarray) -> float:
+    """Return the rate of ascending times in hertz: the mean interval without gaps (over 2.5 medians).
+
+    Parameters
+    ----------
+    t_ns : ndarray of int64, shape (n,)
+        Times; repeated and backward ones are left out.
+
+    Returns
+    -------
+    float
+        Hertz; 0 where fewer than two distinct times are there.
+    """
+    intervals = np.diff(t_ns)
+    intervals = intervals[intervals > 0]
+    if not intervals.size:
+        return 0.0
+    usual = intervals[intervals <= 2.5 * np.median(intervals)]
+    return float(1e9 / usual.mean())
+
+
+class RecordingSource:
+    """Messages of a recording, or of a part of its topics.
+
+    Parameters
+    ----------
+    recording : Recording
+        As :func:`marcha.recording.open` gives it.
+    max_rows : int
+        Largest number of rows in a batch; bounds memory.
+    """
+
+    seekable = True
+
+    def __init__(self, recording: Recording, max_rows: int = 65_536) -> None:
+        self.recording = recording
+        self.name = Path(recording.path).name
+        self.max_rows = max_rows
+        self.channels: dict[str, PlannedChannel] = {
+            topic: PlannedChannel(topic, c.schema, c.frame_id, tuple(c.columns), dict(c.metadata))
+            for topic, c in recording.channels.items()
+            if c.columns  # others cannot be read; they are copied verbatim all the same
+        }
+        self.start_ns = recording.start_ns
+        self.end_ns = recording.end_ns
+        self._rates: dict[str, float] = {}
+
+    def rate_hz(self, topic: str) -> float:
+        """Return the rate of the channel's first samples in hertz."""
+        if topic not in self._rates:
+            head = next(iter(self.recording.windows([topic], max_rows=RATE_ROWS)), None)
+            times = np.empty(0, np.int64)
+            if head is not None and topic in head.tables:
+                times = head.tables[topic]["t_ns"].head(RATE_ROWS).to_numpy()
+            self._rates[topic] = measured_rate(times)
+        return self._rates[topic]
+
+    def batches(
+        self, topics: Sequence[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Batch]:
+        """Yield batches of these topics, log time in [start_ns, end_ns)."""
+        order = [t for t in self.channels if t in set(topics)]
+        windows = self.recording.windows(order, start_ns=start_ns, end_ns=end_ns, max_rows=self.max_rows)
+        for window in windows:
+            tables = {t: window.tables[t] for t in order if t in window.tables and window.tables[t].height}
+            yield Batch(window.end_ns, tables)
+
+
+class LiveSource:
+    """Messages that arrive now, from an iterator or put in by another thread.
+
+    Parameters
+    ----------
+    channels : sequence of PlannedChannel
+        What will come. A channel's metadata may say ``rate_hz``.
+    messages : iterable of (topic, t_ns, values), optional
+        Read in a thread of its own until it ends. Without it, call :meth:`put` and :meth:`close`.
+        ``values`` are numbers in the order of the channel's columns.
+    name : str
+        What the lineage says about the input.
+    capacity : int
+        Messages that may wait; whoever puts more waits until the engine has caught up.
+
+    Notes
+    -----
+    A message is known when it arrives, so its log time is its own time, or the latest seen so far where it
+    arrives late: log time never decreases. Repeated and backward times within a channel stay in the record;
+    the engine does not feed them and says so.
+    """
+
+    seekable = False
+
+    def __init__(
+        self,
+        channels: Sequence[PlannedChannel],
+        messages: Iterable[tuple[str, int, Sequence[float]]] | None = None,
+        name: str = "live",
+        capacity: int = 65_536,
+    ) -> None:
+        self.name = name
+        self.channels = {c.topic: c for c in channels}
+        self.start_ns = 0
+        self.end_ns = 0
+        self._queue: queue.Queue[tuple[str, int, Sequence[float]] | BaseException | None] = queue.Queue(
+            capacity
+        )
+        self._closed = False
+        if messages is not None:
+            threading.Thread(target=self._pump, args=(messages,), daemon=True, name="live source").start()
+
+    def _pump(self, messages: Iterable[tuple[str, int, Sequence[float]]]) -> None:
+        try:
+            for topic, t_ns, values in messages:
+                self.put(topic, t_ns, values)
+        except BaseException as error:  # whatever the reader of the device raised belongs to the engine
+            self._queue.put(error)
+        else:
+            self._queue.put(None)
+
+    def put(self, topic: str, t_ns: int, values: Sequence[float]) -> None:
+        """Hand over one message; may be called from any one thread.
+
+        Raises
+        ------
+        UsageError
+            For a topic that was not declared, or a number of values that does not fit its columns.
+        """
+        channel = self.channels.get(topic)
+        if channel is None:
+            raise UsageError(
+                f"live source {self.name}: topic {topic} was not declared; declared: {list(self.channels)}"
+            )
+        if len(values) != len(channel.columns):
+            raise UsageError(
+                f"live source {self.name}: {topic} got {len(values)} values for its {len(channel.columns)} "
+                f"columns {channel.columns}"
+            )
+        self._queue.put((topic, int(t_ns), values))
+
+    def close(self) -> None:
+        """Say that nothing more will come."""
+        self._queue.put(None)
+
+    def rate_hz(self, topic: str) -> float:
+        """Return the rate that the channel's metadata declares (``rate_hz``), else 0."""
+        return float(self.channels[topic].metadata.get("rate_hz", 0) or 0)
+
+    def batches(
+        self, topics: Sequence[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Batch]:
+        """Yield whatever has arrived, as soon as something has; each message comes once."""
+        wanted, latest = set(topics), -(2**63)
+        while not self._closed:
+            rows: dict[str, list[tuple[int, int, Sequence[float]]]] = {
+                t: [] for t in self.channels if t in wanted
+            }
+            for message in self._arrived():
+                topic, t_ns, values = message
+                latest = max(latest, t_ns)
+                inside = (start_ns is None or latest >= start_ns) and (end_ns is None or latest < end_ns)
+                if topic in rows and inside:
+                    rows[topic].append((t_ns, latest, values))
+            tables = {t: self._table(t, r) for t, r in rows.items() if r}
+            if tables:
+                yield Batch(latest, tables)
+
+    def _arrived(self) -> list[tuple[str, int, Sequence[float]]]:
+        """Wait for one message, then take all that are there."""
+        messages: list[tuple[str, int, Sequence[float]]] = []
+        item = self._queue.get()
+        while True:
+            if item is None:
+                self._closed = True
+                return messages
+            if isinstance(item, MarchaError):
+                raise item
+            if isinstance(item, BaseException):
+                raise MarchaError(f"live source {self.name} failed: {item}") from item
+            messages.append(item)
+            try:
+                item = self._queue.get_nowait()
+            except queue.Empty:
+                return messages
+
+    def _table(self, topic: str, rows: list[tuple[int, int, Sequence[float]]]) -> pl.DataFrame:
+        values = np.array([r[2] for r in rows], dtype=np.float64).reshape(len(rows), -1)
+        data: dict[str, Any] = {
+            "t_ns": np.array([r[0] for r in rows], dtype=np.int64),
+            "t_log_ns": np.array([r[1] for r in rows], dtype=np.int64),
+        }
+        return pl.DataFrame(
+            data | {c: values[:, i].copy() for i, c in enumerate(self.channels[topic].columns)}
+        )
