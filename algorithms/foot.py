@@ -19,6 +19,7 @@ from . import layout as la
 from .contract import AlgorithmError, FloatArray, Input, KernelEstimator, Output, Remark
 from .detectors import PITCH, decide, record, start_tilt, track_tilt
 from .layout import (
+    BIAS_GYR,
     C_HI,
     INIT_INDEX,
     KIND,
@@ -43,6 +44,7 @@ from .layout import (
     ROT,
     ROW_MAX,
     ROW_MIN,
+    STANCE_S,
     STARTED,
     STEP_INDEX,
     STEP_LAND,
@@ -266,6 +268,7 @@ def release(s: FloatArray) -> int:
     s[RELEASED] = j + 1
     r = record(s, j)
     s[TIME_OUT] += s[r + R_DT]
+    s[STANCE_S] = s[STANCE_S] + s[r + R_DT] if s[r + R_STILL] > 0.5 else 0.0
     return r
 
 
@@ -339,6 +342,17 @@ def emit_detector(s: FloatArray, r: int, first: int, out: FloatArray) -> None:
     """Write the detector's statistics of the sample at ``r`` to the end of the result, from ``out[first]`` on."""
     for i in range(out.shape[0] - first):
         out[first + i] = s[r + R_STAT + i]
+
+
+@njit(cache=True, nogil=True)
+def at_rest(s: FloatArray, r: int, since: float, rate: float) -> bool:
+    """Return whether the foot has been still for ``since`` s and turns by less than ``rate`` rad/s at ``r``: the
+    condition of a zero angular rate update, stricter than stance, for a walking foot rolls on while it stands.
+    """
+    x = s[r + R_GYR] - s[BIAS_GYR]
+    y = s[r + R_GYR + 1] - s[BIAS_GYR + 1]
+    z = s[r + R_GYR + 2] - s[BIAS_GYR + 2]
+    return s[STANCE_S] >= since and math.sqrt(x * x + y * y + z * z) < rate
 
 
 SIGMA = Output(

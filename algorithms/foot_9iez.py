@@ -116,6 +116,13 @@ def flush(state: FloatArray, out: FloatArray) -> int:
     return results
 
 
+def configure(state: FloatArray, params: Any) -> None:
+    """Write the noise variances of the nine-state filter into ``state``."""
+    state[Q_GYR] = params.sigma_gyr**2
+    state[Q_ACC] = params.sigma_acc**2
+    state[R_VEL] = params.sigma_zupt**2
+
+
 class Foot9Iez(foot.FootEstimator):
     """Error-state Kalman filter with nine states (attitude, position, velocity) and zero-velocity updates.
 
@@ -137,6 +144,4 @@ class Foot9Iez(foot.FootEstimator):
 
     def configure(self, params: Any) -> None:
         """Write the noise variances into the state; P starts at zero."""
-        self.state[Q_GYR] = params.sigma_gyr**2
-        self.state[Q_ACC] = params.sigma_acc**2
-        self.state[R_VEL] = params.sigma_zupt**2
+        configure(self.state, params)

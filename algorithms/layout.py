@@ -82,6 +82,7 @@ ACC_OLD = _take(3)  # acceleration in n at the previous sample
 BIAS_GYR = _take(3)
 BIAS_ACC = _take(3)
 STILL_COUNT = _take()
+STANCE_S = _take()  # s that the foot has been still without a break, at the released sample
 
 # Steps
 STEP_MIN_S = _take()
