@@ -153,9 +153,9 @@ class Encoder:
             message[path] = value
         record = np.concatenate([np.zeros(PREFIX.itemsize, "u1"), np.frombuffer(message.tobytes(), "u1")])
         view = record.view(dtype)
-        view["opcode"] = 5
-        view["length"] = record.size - 9
-        view["channel"] = self.channel_id
+        view["@opcode"] = 5
+        view["@length"] = record.size - 9
+        view["@channel"] = self.channel_id
         for path, value in self._constants.items():
             _set(view, path, value)
         self._cache[texts] = dtype, record
@@ -211,9 +211,9 @@ class Encoder:
         data = np.empty((len(t_ns), template.size), "u1")
         data[:] = template
         records = data.view(dtype)[:, 0]
-        records["sequence"] = sequence & 0xFFFFFFFF
-        records["log"] = t_log_ns
-        records["publish"] = t_ns
+        records["@sequence"] = sequence & 0xFFFFFFFF
+        records["@log"] = t_log_ns
+        records["@publish"] = t_ns
         _set_time(records, self._root + self.schema.stamp, t_ns)
         for column, kind, path in self.bindings:
             if kind == "text":
@@ -335,7 +335,7 @@ def record_dtype(layout: Layout) -> np.dtype[Any]:
     prefix = PREFIX.fields or {}
     return np.dtype(
         {
-            "names": [*prefix, *fields],
+            "names": [*(f"@{name}" for name in prefix), *fields],  # @: a message may have a field "length" too
             "formats": [*(f[0] for f in prefix.values()), *(f[0] for f in fields.values())],
             "offsets": [*(f[1] for f in prefix.values()), *(f[1] + PREFIX.itemsize for f in fields.values())],
             "itemsize": PREFIX.itemsize + layout.dtype.itemsize,
