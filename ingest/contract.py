@@ -144,10 +144,17 @@ class ReportBuilder:
         self.kept += int(rows)
 
     def drop(
-        self, kind: str, detail: str, *, count: int = 1, line: int | None = None, subject: str = ""
+        self,
+        kind: str,
+        detail: str,
+        *,
+        count: int = 1,
+        rows: int | None = None,
+        line: int | None = None,
+        subject: str = "",
     ) -> None:
-        """Count rows that become nothing, and say why."""
-        self.dropped += int(count)
+        """Count ``rows`` (default ``count``) that become nothing, and say why."""
+        self.dropped += int(count if rows is None else rows)
         if count:
             self._refuse(kind, detail, line)
         self.note(kind, detail, count=count, line=line, subject=subject)

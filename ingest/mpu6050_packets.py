@@ -1,8 +1,9 @@
-"""Binary packets of the shoe-mounted MPU-6050: 28 bytes a sensor, big-endian.
+r"""Binary packets of the shoe-mounted MPU-6050: 28 bytes a sensor, big-endian.
 
-``'$' id:u8 t_ms:u32 q[4]:i16 a[3]:i16 g[3]:i16 '\\r\\n'``. ``q`` is the unit quaternion of the sensor's motion processor
-(DMP), w x y z in units of 2⁻¹⁴, rotation from the sensor frame to the DMP's level frame, whose heading is zero at
-power-up; ``a`` and ``g`` are counts of the 16-bit converter. ``id`` n gives ``/foot/imu<n>``.
+``'$' id:u8 t_ms:u32 q[4]:i16 a[3]:i16 g[3]:i16 '\r\n'``. ``q`` is the unit quaternion of the sensor's motion
+processor (DMP), w x y z in units of 2⁻¹⁴, rotation from the sensor frame to the DMP's level frame, whose heading is
+zero at power-up; ``a`` and ``g`` are counts of the 16-bit converter. The id is the sensor's number (1, 2, or
+counted from 0) or its bus address (0x68, 0x69).
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ PACKET = np.dtype(
     [("start", "u1"), ("id", "u1"), ("t_ms", ">u4"), ("v", ">i2", 10), ("end", ">u2")], align=False
 )
 SIZE = PACKET.itemsize
-_END = 0x0D0A
+#: What devices send as id, to the sensor's number.
+NUMBERS, ADDRESSES, FROM_ZERO = {1: 1, 2: 2}, {0x68: 1, 0x69: 2}, {0: 1, 1: 2}
 BLOCK_BYTES = 4 << 20
 
 
@@ -57,8 +59,9 @@ class Mpu6050Packets:
 
     def read(self, paths: Sequence[Path], options: Mpu6050Options) -> Import:
         """Read one capture, or several pieces of it in the order given."""
-        ids = _sensor_ids(paths)
-        scale = scales(paths, options, ids)
+        sensor_of = _sensors(paths)
+        numbers = sorted(set(sensor_of.values()))
+        scale = scales(paths, options, numbers)
         report = ReportBuilder()
         metadata = {
             "device": {
@@ -66,16 +69,19 @@ class Mpu6050Packets:
                 "time": "millis() of the controller, unrolled; zero at its boot",
                 "name": "MPU-6050, binary packets",
                 "mounting": options.mounting,
-                "frames": "imu<n>: axes as printed on the sensor, +1 g upwards at rest; orientation: sensor to the "
-                "DMP's level frame, z up, heading zero at power-up",
+                "frames": "imu1, imu2: axes as printed on the sensor, +1 g upwards at rest; orientation: from "
+                "the sensor to the DMP's level frame, z up, heading zero at power-up",
             }
         }
         channels = [
             ChannelSpec(f"/foot/imu{n}", IMU, f"imu{n}", (*AXES, *QUATERNION), scale[n].metadata())
-            for n in ids
+            for n in numbers
         ]
         return Import(
-            channels=channels, blocks=_blocks(paths, scale, report), report=report, metadata=metadata
+            channels=channels,
+            blocks=_blocks(paths, sensor_of, scale, report),
+            report=report,
+            metadata=metadata,
         )
 
 
@@ -96,72 +102,72 @@ def _packet_starts(data: NDArray[np.uint8]) -> NDArray[np.int64]:
     return np.array(kept, dtype=np.int64)
 
 
-def _packets(path: Path) -> Iterator[tuple[NDArray[np.void], NDArray[np.int64], list[tuple[int, int]]]]:
-    """Yield packets, the byte at which each starts (from 0), and the stretches (start, length) that are none."""
+def _packets(path: Path) -> Iterator[tuple[NDArray[np.void], list[tuple[int, int]]]]:
+    """Yield packets, and the stretches (first byte from 0, length) that are none."""
     try:
         with path.open("rb") as f:
-            rest, offset = b"", 0
-            while True:
+            rest, offset, ended = b"", 0, False
+            while not ended:
                 piece = f.read(BLOCK_BYTES)
+                ended = not piece
                 data = np.frombuffer(rest + piece, dtype=np.uint8)
                 starts = _packet_starts(data)
                 ends = starts + SIZE
-                tail = int(ends[-1]) if starts.size else max(0, data.size - SIZE + 1) if piece else 0
-                stop = tail if piece else data.size
-                edges = np.concatenate(([0], ends))
-                nexts = np.concatenate((starts, [stop]))
-                lost = [(offset + int(a), int(b - a)) for a, b in zip(edges, nexts, strict=True) if b > a]
-                bytes_of = (
-                    data[starts[:, None] + np.arange(SIZE)] if starts.size else np.empty((0, SIZE), np.uint8)
+                stop = data.size if ended else max(int(ends[-1]) if starts.size else 0, data.size - SIZE + 1)
+                edges = zip([0, *ends.tolist()], [*starts.tolist(), stop], strict=True)
+                lost = [(offset + a, b - a) for a, b in edges if b > a]
+                found = (
+                    np.lib.stride_tricks.sliding_window_view(data, SIZE)[starts] if starts.size else data[:0]
                 )
-                yield np.ascontiguousarray(bytes_of).view(PACKET).reshape(-1), offset + starts, lost
+                yield np.ascontiguousarray(found).view(PACKET).reshape(-1), lost
                 rest, offset = data[stop:].tobytes(), offset + stop
-                if not piece:
-                    return
     except OSError as error:
         raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def _sensor_ids(paths: Sequence[Path]) -> list[int]:
-    """Return the device ids in the first block of each file."""
+def _sensors(paths: Sequence[Path]) -> dict[int, int]:
+    """Return device id to sensor number (1 or 2), from the first block of each file."""
     ids: set[int] = set()
     for path in paths:
         packets, _, _ = next(_packets(path))
         ids |= {int(i) for i in np.unique(packets["id"])}
     if not ids:
         raise MarchaError(f"{paths[0]}: no 28-byte '$' packet in it; is it the device's binary log?")
-    return sorted(ids)
+    for known in (FROM_ZERO, NUMBERS, ADDRESSES) if 0 in ids else (NUMBERS, ADDRESSES):
+        if any(i in known for i in ids):
+            return {i: n for i, n in known.items() if i in ids}
+    raise MarchaError(f"{paths[0]}: packets of devices {sorted(ids)}; known ids are 1 2, 0 1 or 0x68 0x69")
 
 
 def _blocks(
-    paths: Sequence[Path], scale: dict[int, Scale], report: ReportBuilder
+    paths: Sequence[Path], sensor_of: dict[int, int], scale: dict[int, Scale], report: ReportBuilder
 ) -> Iterator[tuple[str, pl.DataFrame]]:
-    sensors = {n: _Sensor(n, s, report) for n, s in scale.items()}
+    sensors = {i: _Sensor(n, scale[n], report) for i, n in sensor_of.items()}
     number = 0  # packets so far: findings count packets from 1
     for path in paths:
-        for packets, _, lost in _packets(path):
+        for packets, lost in _packets(path):
             for start, length in lost:
                 report.drop(
                     "lost_bytes",
-                    f"{path.name}: {length} bytes from byte {start} on are no packet; read on at the next one",
+                    f"{path.name}: bytes that are no packet, first {length} from byte {start} on; read on behind",
+                    count=length,
+                    rows=-(-length // SIZE),
                     line=number + 1,
-                    subject="",
                 )
             numbers = np.arange(number + 1, number + 1 + len(packets))
             number += len(packets)
-            ids = packets["id"]
-            for n in np.unique(ids).tolist():
-                mine = ids == n
-                if n not in sensors:
-                    at = numbers[mine]
-                    report.drop(
-                        "bad_row",
-                        f"packet of device {n}, which is not in the first part of the log: dropped",
-                        count=len(at),
-                        line=int(at[0]),
-                    )
+            for i in np.unique(packets["id"]).tolist():
+                mine = packets["id"] == i
+                if i in sensors:
+                    yield from sensors[i].feed(packets[mine], numbers[mine])
                     continue
-                yield from sensors[n].feed(packets[mine], numbers[mine])
+                strangers = numbers[mine]
+                report.drop(
+                    "bad_row",
+                    f"packet of device {i}; the log is of {', '.join(map(str, sensors))}: dropped",
+                    count=len(strangers),
+                    line=int(strangers[0]),
+                )
     for sensor in sensors.values():
         yield from sensor.finish()
 
