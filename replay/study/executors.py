@@ -1,0 +1,200 @@
+"""Where a study's tasks run: in this process, in a pool of processes, or on a Dask cluster.
+
+All three take the same function and yield the same outcomes; only the order differs.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+from ...recording import MarchaError, UsageError
+
+T = TypeVar("T")
+R = TypeVar("R")
+Outcome = tuple[T, R | Exception]
+
+#: One process per core, one thread per process: libraries must not each start threads for all cores.
+SINGLE_THREAD = {
+    "POLARS_MAX_THREADS": "1",
+    "NUMBA_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def execute(
+    function: Callable[[T], R],
+    tasks: Sequence[T],
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> Iterator[Outcome[T, R]]:
+    """Run ``function`` on every task and yield (task, result or the exception it raised) as they finish.
+
+    Parameters
+    ----------
+    function : callable
+        Module-level function; function and tasks must be picklable.
+    tasks : sequence
+        The first one should be the cheapest: it runs here while the pool starts, and fills numba's caches on disk
+        once for all workers.
+    workers : int, optional
+        Processes; by default one a core. 1 runs everything in this process.
+    scheduler : str, optional
+        Address of a Dask scheduler (``tcp://host:8786``) to use instead of a pool.
+
+    Raises
+    ------
+    UsageError
+        For a scheduler that cannot be reached, without the ``cluster`` extra, or with ``workers`` as well.
+    """
+    if workers is not None and workers < 1:
+        raise UsageError(f"workers={workers}: at least 1")
+    if scheduler is not None:
+        if workers is not None:
+            raise UsageError("give either workers or a scheduler: a Dask cluster has workers of its own")
+        return _dask(function, tasks, scheduler)
+    count = min(cores() if workers is None else workers, len(tasks))
+    return _here(function, tasks) if count <= 1 else _pool(function, tasks, count)
+
+
+def _attempt(function: Callable[[T], R], task: T) -> R | Exception:
+    try:
+        return function(task)
+    except Exception as error:  # one cell's failure must not end the study
+        return error
+
+
+def _here(function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outcome[T, R]]:
+    for task in tasks:
+        yield task, _attempt(function, task)
+
+
+def _start_worker() -> None:
+    """Leave Ctrl-C to the parent, which lets running tasks end and keeps their results."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _ready() -> None:
+    """Make a worker import what the tasks need before there is one for it."""
+    from . import cells  # noqa: F401
+
+
+@contextmanager
+def _environment(values: dict[str, str]) -> Iterator[None]:
+    old = {k: os.environ.get(k) for k in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for key, value in old.items():
+            if value is None:
+                os.environ.pop(key, None)
+            else:
+                os.environ[key] = value
+
+
+def _start(count: int) -> ProcessPoolExecutor:
+    import multiprocessing
+
+    # spawn: threads of polars and numba do not survive a fork, and it is the same on every system.
+    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_start_worker)
+    with _environment(SINGLE_THREAD):  # read when a worker starts, which submit does
+        for _ in range(count):
+            pool.submit(_ready)
+    return pool
+
+
+def _pool(function: Callable[[T], R], tasks: Sequence[T], count: int) -> Iterator[Outcome[T, R]]:
+    lost: list[T] = []
+    pool = _start(count)
+    try:
+        yield tasks[0], _attempt(function, tasks[0])
+        waiting = list(reversed(tasks[1:]))
+        running: dict[Future[R], T] = {}
+        while waiting or running:
+            # Two tasks a worker: none waits for the parent, and a broken pool loses little.
+            while waiting and len(running) < 2 * count and not lost:
+                try:
+                    future = pool.submit(function, waiting[-1])
+                except BrokenProcessPool:
+                    lost.append(waiting.pop())
+                    break
+                running[future] = waiting.pop()
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                task = running.pop(future)
+                error = future.exception()
+                if isinstance(error, BrokenProcessPool):
+                    lost.append(task)
+                elif error is not None and not isinstance(error, Exception):
+                    raise error
+                else:
+                    yield task, error if error is not None else future.result()
+            if lost and not running:
+                pool.shutdown()
+                yield from _one_by_one(function, lost)
+                lost = []
+                pool = _start(count)
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _one_by_one(function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outcome[T, R]]:
+    """Find out which task kills its worker: each gets a process of its own."""
+    for task in tasks:
+        with _start(1) as pool:
+            try:
+                yield task, pool.submit(_attempt, function, task).result()
+            except BrokenProcessPool:
+                yield (
+                    task,
+                    MarchaError(
+                        "the worker process died: out of memory, a crash in compiled code, or a calling script "
+                        "without `if __name__ == '__main__':`"
+                    ),
+                )
+
+
+def _dask(function: Callable[[T], R], tasks: Sequence[T], address: str) -> Iterator[Outcome[T, R]]:
+    try:
+        from dask import distributed  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise UsageError(
+            f"{address}: a Dask scheduler needs the extra `cluster`; pip install 'marcha[cluster]'"
+        ) from None
+    try:
+        client: Any = distributed.Client(address, timeout="10s", set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise UsageError(f"{address}: no Dask scheduler answers ({reason}); start `dask scheduler`") from None
+    return _dask_outcomes(distributed, client, function, tasks)
+
+
+def _dask_outcomes(
+    distributed: Any, client: Any, function: Callable[[T], R], tasks: Sequence[T]
+) -> Iterator[Outcome[T, R]]:
+    with client:
+        futures = {client.submit(_attempt, function, task, pure=False): task for task in tasks}
+        try:
+            for future in distributed.as_completed(futures):
+                task = futures.pop(future)
+                error = future.exception()
+                if error is None:
+                    yield task, future.result()
+                else:  # the cluster itself gave up on it: worker killed, function not importable there
+                    yield task, error if isinstance(error, Exception) else MarchaError(repr(error))
+                future.release()
+        finally:
+            client.cancel(list(futures))

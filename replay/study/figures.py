@@ -1,0 +1,329 @@
+"""The study's pictures: box plots, Q-Q plots, tracks, run times and consistency.
+
+Every function returns a matplotlib figure; none shows or saves one. One colour means one filter throughout.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from . import config as cfg
+from .analysis import order
+from .cells import Cell
+from .report import Picture
+from .store import write_atomic
+
+#: Okabe and Ito (2008): told apart with every kind of colour vision.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#F0E442")
+GREY = "#666666"
+
+#: matplotlib's settings for all figures; text stays text in SVG.
+STYLE: dict[str, Any] = {
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e3e3e3",
+    "svg.fonttype": "none",
+    "svg.hashsalt": "marcha",
+    "figure.constrained_layout.use": True,
+}
+
+Samples = Mapping[str, np.ndarray]
+
+
+def colour(index: int) -> str:
+    """Return the colour of the level with this number."""
+    return COLOURS[index % len(COLOURS)]
+
+
+def _samples(frame: pl.DataFrame, factor: str, levels: Sequence[str]) -> dict[str, np.ndarray]:
+    good = frame.filter(~pl.col("outlier") & pl.col("value").is_finite())
+    found = {level: good.filter(pl.col(factor) == level)["value"].to_numpy() for level in levels}
+    return {level: values for level, values in found.items() if len(values)}
+
+
+def _box(
+    ax: Axes, samples: Samples, colours: Sequence[str], positions: Sequence[float], width: float
+) -> None:
+    """Draw boxes (quartiles, whiskers to 1.5 interquartile ranges), means and, below 20, every value."""
+    parts = ax.boxplot(
+        list(samples.values()),
+        positions=list(positions),
+        widths=width,
+        patch_artist=True,
+        manage_ticks=False,
+        showmeans=True,
+        meanprops={"marker": "D", "markersize": 4, "markerfacecolor": "white", "markeredgecolor": "black"},
+        medianprops={"color": "black"},
+        flierprops={"marker": ".", "markersize": 4, "markerfacecolor": GREY, "markeredgecolor": GREY},
+    )
+    for box, face in zip(parts["boxes"], colours, strict=True):
+        box.set(facecolor=face, alpha=0.65)
+    for position, values in zip(positions, samples.values(), strict=True):
+        if len(values) < 20:
+            spread = np.linspace(-0.15, 0.15, len(values)) * width if len(values) > 1 else np.zeros(1)
+            ax.plot(position + spread, values, ".", color="black", markersize=3, alpha=0.7)
+
+
+def _axis_label(frame: pl.DataFrame) -> str:
+    metric, unit = frame["metric"][0], frame["unit"][0]
+    return f"{metric} ({unit})" if unit else metric
+
+
+def _scale(ax: Axes, frame: pl.DataFrame, log: bool) -> None:
+    values = frame.filter(~pl.col("outlier") & pl.col("value").is_finite())["value"]
+    if log and len(values) and float(values.min()) > 0:  # pyright: ignore[reportArgumentType]
+        ax.set_yscale("log")
+    elif len(values) and float(values.min()) >= 0:  # pyright: ignore[reportArgumentType]
+        ax.set_ylim(bottom=0)
+
+
+def box_by(
+    frame: pl.DataFrame, config: cfg.StudyConfig, factor: str, *, log: bool = False, title: str = ""
+) -> Figure:
+    """Box plot of one metric's values (rows of :func:`~marcha.replay.study.analysis.values`) by one factor."""
+    levels = order(frame, config)[factor]
+    samples = _samples(frame, factor, levels)
+    figure = Figure(figsize=(max(4.5, 1.6 + 0.9 * len(samples)), 3.8))
+    ax = figure.subplots()
+    colours = [colour(levels.index(s)) if factor == "filter" else "#9db4c8" for s in samples]
+    _box(ax, samples, colours, range(len(samples)), 0.6)
+    long = sum(map(len, samples)) > 45
+    labels = [f"{level}\nn = {len(v)}" for level, v in samples.items()]
+    ax.set_xticks(range(len(samples)), labels, rotation=30 if long else 0, ha="right" if long else "center")
+    ax.grid(axis="x", visible=False)
+    ax.set(xlabel=factor, ylabel=_axis_label(frame), title=title or f"{frame['metric'][0]} by {factor}")
+    _scale(ax, frame, log)
+    return figure
+
+
+def box_by_both(
+    frame: pl.DataFrame, config: cfg.StudyConfig, *, log: bool = False, title: str = ""
+) -> Figure:
+    """Box plot of one metric by configuration, and by filter within each."""
+    levels = order(frame, config)
+    filters, configurations = levels["filter"], levels["configuration"]
+    figure = Figure(figsize=(max(6.0, 1.5 + 0.42 * len(filters) * len(configurations)), 4.0))
+    ax = figure.subplots()
+    width = 0.8 / max(1, len(filters))
+    for i, configuration in enumerate(configurations):
+        samples = _samples(frame.filter(pl.col("configuration") == configuration), "filter", filters)
+        numbers = [filters.index(s) for s in samples]
+        positions = [i - 0.4 + width * (k + 0.5) for k in numbers]
+        _box(ax, samples, [colour(k) for k in numbers], positions, 0.8 * width)
+    ax.set_xticks(range(len(configurations)), configurations)
+    ax.set_xlim(-0.5, len(configurations) - 0.5)
+    for i in range(1, len(configurations)):
+        ax.axvline(i - 0.5, color="#c8c8c8", linewidth=0.8)
+    ax.grid(axis="x", visible=False)
+    ax.set(xlabel="configuration", ylabel=_axis_label(frame))
+    ax.set_title(title or f"{frame['metric'][0]} by configuration and filter")
+    handles = [Patch(facecolor=colour(k), alpha=0.65, label=name) for k, name in enumerate(filters)]
+    mean = Line2D(
+        [], [], marker="D", linestyle="", markersize=4, markerfacecolor="white", color="black", label="mean"
+    )
+    figure.legend(
+        handles=[*handles, mean], loc="outside lower center", ncols=min(5, len(handles) + 1), frameon=False
+    )
+    _scale(ax, frame, log)
+    return figure
+
+
+def qq(frame: pl.DataFrame, config: cfg.StudyConfig, *, title: str = "") -> Figure | None:
+    """Normal Q-Q plots of one metric, a panel a configuration × filter; None where every group is too small."""
+    from scipy import stats
+
+    levels = order(frame, config)
+    filters, configurations = levels["filter"], levels["configuration"]
+    least = config.statistics.min_samples
+    good = frame.filter(~pl.col("outlier") & pl.col("value").is_finite())
+    groups = {
+        key: part["value"].to_numpy()
+        for key, part in good.group_by("configuration", "filter")
+        if len(part) >= least
+    }
+    rows = [c for c in configurations if any((c, f) in groups for f in filters)]
+    columns = [f for f in filters if any((c, f) in groups for c in rows)]
+    if not rows:
+        return None
+    figure = Figure(figsize=(0.8 + 2.3 * len(columns), 0.9 + 2.1 * len(rows)))
+    axes = figure.subplots(len(rows), len(columns), squeeze=False)
+    for i, configuration in enumerate(rows):
+        for k, name in enumerate(columns):
+            ax = axes[i, k]
+            values = groups.get((configuration, name))
+            if i == 0:
+                ax.set_title(name)
+            if k == 0:
+                ax.set_ylabel(configuration)
+            if values is None:
+                ax.text(0.5, 0.5, "too few values", transform=ax.transAxes, ha="center", color=GREY)
+                ax.set(xticks=[], yticks=[])
+                continue
+            (quantiles, ordered), (slope, intercept, _) = stats.probplot(values)
+            ax.plot(quantiles, ordered, ".", color=colour(filters.index(name)), markersize=5)
+            ends = np.array([quantiles[0], quantiles[-1]])
+            ax.plot(ends, intercept + slope * ends, color="black", linewidth=0.9)
+            ax.tick_params(labelsize=8)
+    figure.supxlabel("quantiles of the standard normal distribution")
+    figure.supylabel(_axis_label(frame) + ", by configuration")
+    figure.suptitle(title or f"Q-Q plots of {frame['metric'][0]}")
+    return figure
+
+
+def tracks(cells: Sequence[Cell], config: cfg.StudyConfig, *, title: str = "") -> Figure | None:
+    """Overlaid tracks seen from above, a panel a configuration × filter."""
+    drawn = [c for c in cells if c.status == "ok" and len(c.positions) > 1]
+    if not drawn:
+        return None
+    filters = [
+        f for f in dict.fromkeys(m.label for m in cfg.methods(config)) if any(c.label == f for c in drawn)
+    ]
+    configurations = sorted({c.configuration for c in drawn})
+    figure = Figure(figsize=(0.8 + 2.5 * len(filters), 0.9 + 2.4 * len(configurations)))
+    axes = figure.subplots(len(configurations), len(filters), squeeze=False, sharex=True, sharey=True)
+    ends = np.concatenate([c.positions[:, :2] for c in drawn])
+    # A diverged track must not shrink all the others to a dot.
+    low, high = np.nanpercentile(ends, 1, axis=0), np.nanpercentile(ends, 99, axis=0)
+    reach = 0.62 * max(float((high - low).max()), 0.5)
+    middle = (low + high) / 2
+    for i, configuration in enumerate(configurations):
+        for k, name in enumerate(filters):
+            ax = axes[i, k]
+            own = [c for c in drawn if c.configuration == configuration and c.label == name]
+            alpha = min(1.0, max(0.15, 4 / max(1, len(own))))
+            outside = 0
+            for cell in own:
+                x, y, _ = cell.positions.T
+                ax.plot(
+                    x, y, color=colour(k), linewidth=0.9, alpha=alpha, linestyle="--" if cell.clipped else "-"
+                )
+                ax.plot(x[-1], y[-1], "o", color="black", markersize=2.5, alpha=max(alpha, 0.4))
+                outside += bool((np.abs(cell.positions[:, :2] - middle) > reach).any())
+            ax.plot(0, 0, "+", color="black", markersize=8)
+            ax.set_aspect("equal", adjustable="box")
+            note = f"n = {len(own)}" + (f", {outside} leave the frame" if outside else "")
+            ax.text(0.02, 0.98, note, transform=ax.transAxes, va="top", fontsize=8, color=GREY)
+            if i == 0:
+                ax.set_title(name)
+            if k == 0:
+                ax.set_ylabel(f"{configuration}\ny (m)")
+            if i == len(configurations) - 1:
+                ax.set_xlabel("x (m)")
+    axes[0, 0].set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[1] - reach, middle[1] + reach))
+    figure.suptitle(
+        title
+        or "Tracks from above; + start, dots ends"
+        + (", dashed: clipped input" if any(c.clipped for c in drawn) else "")
+    )
+    return figure
+
+
+def consistency(table: pl.DataFrame, *, title: str = "") -> Figure:
+    """Mean normalized error squared of every filter with the interval that a consistent filter lies in.
+
+    ``table`` has ``metric, filter, mean, low, high`` (see :func:`~marcha.replay.study.analysis.consistency`).
+    """
+    metrics = table["metric"].unique(maintain_order=True).to_list()
+    filters = table["filter"].unique(maintain_order=True).to_list()
+    figure = Figure(figsize=(1.5 + 3.4 * len(metrics), 3.6))
+    axes = figure.subplots(1, len(metrics), squeeze=False)[0]
+    for ax, metric in zip(axes, metrics, strict=True):
+        part = table.filter(pl.col("metric") == metric)
+        for row in part.iter_rows(named=True):
+            k = filters.index(row["filter"])
+            ax.plot(k, row["mean"], "o", color=colour(k), markersize=8)
+        low, high = part["low"][0], part["high"][0]
+        ax.axhspan(low, high, color="#bcd9bc", label=f"consistent: {low:.2f} to {high:.2f}")
+        ax.set_xticks(range(len(filters)), filters, rotation=20, ha="right")
+        ax.set_xlim(-0.5, len(filters) - 0.5)
+        ax.set_yscale("log")
+        ax.set(title=metric, ylabel="mean NEES (1)")
+        ax.legend(fontsize=8)
+    figure.suptitle(title or "Consistency of the filters' covariance (above the band: too sure of itself)")
+    return figure
+
+
+def _figures(
+    frame: pl.DataFrame, cells: Sequence[Cell], nees: pl.DataFrame, config: cfg.StudyConfig
+) -> Iterator[tuple[str, str, str, Figure | None]]:
+    """Yield (name, section, caption, figure) of everything that the study has to show."""
+    levels = order(frame, config)
+    first = levels["detector"][0] if levels["detector"] else ""
+    with_detector = f", detector {first}" if first else ""
+    shown = frame.filter(pl.col("detector") == first)
+    for metric in config.metrics:
+        title = cfg.metric_title(metric)
+        part = shown.filter((pl.col("metric") == title) & pl.col("value").is_finite())
+        if not len(part):
+            continue
+        stem = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
+        section = "run time" if metric.column == "run_time_s" else "box"
+        for factor in ("filter", "configuration"):
+            if len(levels[factor]) > 1:
+                caption = f"{title} by {factor}, all other factors together{with_detector}."
+                yield f"box-{stem}-{factor}", section, caption, box_by(part, config, factor, log=metric.log)
+        caption = f"{title} by configuration and filter{with_detector}."
+        yield f"box-{stem}-both", section, caption, box_by_both(part, config, log=metric.log)
+        if len(levels["detector"]) > 1 and section == "box":
+            whole = frame.filter((pl.col("metric") == title) & pl.col("value").is_finite())
+            caption = f"{title} by detector, all filters and configurations together."
+            yield f"box-{stem}-detector", section, caption, box_by(whole, config, "detector", log=metric.log)
+        if section == "box":
+            caption = f"{title}: ordered values against normal quantiles; on the line they are normal{with_detector}."
+            yield f"qq-{stem}", "qq", caption, qq(part, config)
+    if config.tracks:
+        own = [c for c in cells if c.detector == first]
+        caption = (
+            f"Tracks seen from above, start at the cross{with_detector}. Headings at the start are all zero."
+        )
+        yield "tracks", "tracks", caption, tracks(own, config)
+    pooled = nees.filter((pl.col("configuration") == "") & (pl.col("detector") == first))
+    if len(pooled):
+        yield "consistency", "consistency", f"Mean NEES over all walks{with_detector}.", consistency(pooled)
+
+
+def draw_all(
+    folder: Path, frame: pl.DataFrame, cells: Sequence[Cell], nees: pl.DataFrame, config: cfg.StudyConfig
+) -> tuple[list[Picture], list[Path]]:
+    """Draw every figure and write it as PNG and SVG.
+
+    Returns
+    -------
+    (list of Picture, list of Path)
+        The pictures for the report, and all files written; older figures in the folder are removed.
+    """
+    import matplotlib
+
+    pictures: list[Picture] = []
+    files: list[Path] = []
+    with matplotlib.rc_context({**matplotlib.rcParamsDefault, **STYLE}):
+        for name, section, caption, figure in _figures(frame, cells, nees, config):
+            if figure is None:
+                continue
+            for suffix in (".png", ".svg"):
+                data = io.BytesIO()
+                metadata = {"Date": None} if suffix == ".svg" else {}
+                figure.savefig(data, format=suffix[1:], dpi=120, metadata=metadata)
+                path = folder / f"{name}{suffix}"
+                write_atomic(path, lambda part, data=data: part.write_bytes(data.getvalue()))
+                files.append(path)
+                if suffix == ".png":
+                    pictures.append(Picture(name, section, caption, data.getvalue()))
+    for old in {*folder.glob("*.png"), *folder.glob("*.svg")} - set(files):
+        old.unlink()
+    return pictures, files
