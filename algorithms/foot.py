@@ -374,6 +374,13 @@ class FootEstimator(KernelEstimator):
     state_size: ClassVar[int] = la.CORE
     has_sigma: ClassVar[bool] = True
     extra_inputs: ClassVar[tuple[Input, ...]] = ()
+    presets: ClassVar[dict[str, dict[str, Any]]] = {
+        "live": {"window_side": "trailing", "cleaning": "median"},
+        "shoe-tuned": {"detector": "shoe", "shoe_max": 1e5},
+        "are-tuned": {"detector": "are", "are_max": 0.3},
+        "mv-tuned": {"detector": "mv", "mv_max": 0.3, "window_s": 0.15},
+        "mag-tuned": {"detector": "mag", "mag_max": 0.4, "window_s": 0.15},
+    }
 
     def __init__(self, params: msgspec.Struct | None = None) -> None:
         super().__init__(params)

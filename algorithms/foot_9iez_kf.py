@@ -19,6 +19,7 @@ M = 6
 TILT, BIAS = 0, 3
 
 _take = la.Allocator(base.SIZE)
+FEEDBACK = _take()
 Q_TURN = _take()
 Q_BIAS = _take()
 R_LEVEL = _take()
@@ -67,6 +68,12 @@ class Foot9IezKfParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=T
     zaru_gyr_max: Annotated[
         float, meta("Zero angular rate only below so small a rate (bias taken off)", "rad/s", "ours", gt=0.0)
     ] = 0.05
+    zupt_turns: Annotated[
+        bool,
+        meta(
+            "Let the zero-velocity update correct this orientation too, which the source leaves to its own filter"
+        ),
+    ] = False
 
 
 @njit(cache=True, nogil=True)
@@ -123,7 +130,7 @@ def _navigate(s: FloatArray, out: FloatArray) -> None:
         _advance(s, r)
         base.predict(s, s[r + R_DT])
         if s[r + R_STILL] > 0.5:
-            base.zero_velocity(s, 3)
+            base.zero_velocity(s, 0 if s[FEEDBACK] > 0.5 else 3)
     foot.emit(s, r, out)
     foot.emit_sigma(s, base.P, base.N, base.XPOS, base.XVEL, base.ATT, out)
     for i in range(3):
@@ -187,6 +194,7 @@ class Foot9IezKf(foot.FootEstimator):
     def configure(self, params: Any) -> None:
         """Write the noise variances, the gates and the initial covariance into the state."""
         base.configure(self.state, params)
+        self.state[FEEDBACK] = params.zupt_turns
         s = self.state
         s[Q_TURN], s[Q_BIAS] = params.sigma_turn**2, params.sigma_gyr_walk**2
         s[R_LEVEL], s[LEVEL_GATE] = params.sigma_level**2, params.level_gate

@@ -16,6 +16,7 @@ from .parameters import meta
 from .rotations import quat_from_rot, rot_from_quat
 
 _take = la.Allocator(base.SIZE)
+FEEDBACK = _take()
 BETA = _take()
 QUAT = _take(4)
 SIZE = _take.size
@@ -33,6 +34,12 @@ class Foot9IezMadParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=
             ge=0.0,
         ),
     ] = 0.033
+    zupt_turns: Annotated[
+        bool,
+        meta(
+            "Let the zero-velocity update correct this orientation too, which the source leaves to its own filter"
+        ),
+    ] = False
 
 
 @njit(cache=True, nogil=True)
@@ -112,7 +119,9 @@ def _navigate(s: FloatArray, out: FloatArray) -> None:
         _advance(s, r)
         base.predict(s, s[r + R_DT])
         if s[r + R_STILL] > 0.5:
-            base.zero_velocity(s, 3)
+            base.zero_velocity(s, 0 if s[FEEDBACK] > 0.5 else 3)
+            if s[FEEDBACK] > 0.5:
+                quat_from_rot(s, ROT, s, QUAT)
     foot.emit(s, r, out)
     foot.emit_sigma(s, base.P, base.N, base.XPOS, base.XVEL, base.ATT, out)
     foot.emit_detector(s, r, base.FIRST_DETECTOR, out)
@@ -171,4 +180,5 @@ class Foot9IezMad(foot.FootEstimator):
     def configure(self, params: Any) -> None:
         """Write the noise variances and the gain into the state."""
         base.configure(self.state, params)
+        self.state[FEEDBACK] = params.zupt_turns
         self.state[BETA] = params.beta
