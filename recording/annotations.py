@@ -1,20 +1,141 @@
-"""Annotations: labelled intervals of a recording, as ``foxglove_msgs/msg/Event`` on ``/annotation/<tier>``."""
+"""Annotations: labelled intervals, as ``foxglove_msgs/msg/Event`` on ``/annotation/<tier>``."""
 
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from typing import Any
 
+import numpy as np
 import polars as pl
 
-if TYPE_CHECKING:
-    from .reader import Recording
+from .cdr import CdrError, decode, encode
+from .codec import MAX_TIME_NS, PREFIX, SECOND, Messages
+from .definitions import Library, load
+from .errors import MarchaError
 
 EVENT = "foxglove_msgs/msg/Event"
-PREFIX = "/annotation/"
-COLUMNS = {"tier": pl.String, "start_ns": pl.Int64, "end_ns": pl.Int64, "label": pl.String, "metadata": pl.String}
+TOPIC = "/annotation/"
+COLUMNS: dict[str, Any] = {
+    "tier": pl.String,
+    "start_ns": pl.Int64,
+    "end_ns": pl.Int64,
+    "label": pl.String,
+    "metadata": pl.String,
+}
+"""Columns of an annotation table; ``metadata`` is the text of a JSON object of strings."""
 
 
-def read_annotations(rec: Recording) -> pl.DataFrame:
-    """Return all annotations of a recording by start time."""
-    return pl.DataFrame(schema=COLUMNS)
+def check_annotations(table: pl.DataFrame) -> pl.DataFrame:
+    """Return the table with all of :data:`COLUMNS` in order, sorted by tier and start.
+
+    Parameters
+    ----------
+    table : polars.DataFrame
+        ``tier``, ``start_ns``, ``end_ns`` (inclusive, both), ``label``; optional ``metadata``: JSON text, a struct, or null.
+
+    Raises
+    ------
+    MarchaError
+        A column is missing, unknown or of the wrong type, an interval ends before it starts, a tier is not one
+        part of a topic, or metadata is not an object.
+    """
+    if "metadata" not in table.columns:
+        table = table.with_columns(pl.lit("{}").alias("metadata"))
+    if set(table.columns) != set(COLUMNS):
+        odd = ", ".join(sorted(set(table.columns) ^ set(COLUMNS)))
+        raise MarchaError(f"annotations: columns missing or unknown: {odd}; they are {', '.join(COLUMNS)}")
+    values = [_metadata(v) for v in table["metadata"].to_list()]
+    table = table.with_columns(pl.Series("metadata", values, dtype=pl.String)).select(*COLUMNS)
+    for name, kind in COLUMNS.items():
+        if table.height and table.schema[name] != kind:
+            raise MarchaError(f"annotations: column {name!r}: type {table.schema[name]}, must be {kind}")
+        if table[name].null_count():
+            raise MarchaError(f"annotations: column {name!r} has nulls")
+    table = table.cast(COLUMNS)
+    bad = table.filter(
+        (pl.col("end_ns") < pl.col("start_ns")) | (pl.col("start_ns") < 0) | (pl.col("end_ns") > MAX_TIME_NS)
+    )
+    if bad.height:
+        row = bad.row(0)
+        raise MarchaError(
+            f"annotations: {row[0]}: {row[3]!r}: from {row[1]} to {row[2]} ns is no interval of the recording"
+        )
+    for tier in table["tier"].unique().to_list():
+        if not tier or tier.startswith("/") or tier != tier.strip():
+            raise MarchaError(f"annotations: tier {tier!r} must be a plain name; its topic is {TOPIC}<tier>")
+    return table.sort("tier", "start_ns", maintain_order=True)
+
+
+def _metadata(value: Any) -> str:
+    if isinstance(value, str):
+        try:
+            value = json.loads(value or "{}")
+        except ValueError:
+            raise MarchaError(f"annotations: metadata {value!r} is not the text of a JSON object") from None
+    if value is None:
+        value = {}
+    if not isinstance(value, dict):
+        raise MarchaError(f"annotations: metadata {value!r} is not an object")
+    if "label" in value:
+        raise MarchaError("annotations: metadata may not have the key 'label'; it holds the label itself")
+    texts = {
+        str(k): v if isinstance(v, str) else json.dumps(v, ensure_ascii=False)
+        for k, v in value.items()
+        if v is not None
+    }
+    return json.dumps(texts, ensure_ascii=False, sort_keys=True)
+
+
+def encode_events(rows: pl.DataFrame, channel_id: int) -> Iterator[tuple[int, bytes]]:
+    """Yield log time and message record of every annotation of one tier."""
+    library = load(EVENT)
+    definition = next(iter(library.values()))
+    for i, (start, end, label, text) in enumerate(
+        rows.select("start_ns", "end_ns", "label", "metadata").iter_rows()
+    ):
+        pairs = {"label": label, **json.loads(text)}
+        value = {
+            "start_time": {"sec": start // SECOND, "nanosec": start % SECOND},
+            "end_time": {"sec": end // SECOND, "nanosec": end % SECOND},
+            "metadata": [{"key": k, "value": v} for k, v in pairs.items()],
+        }
+        try:
+            message = encode(value, definition, library)
+        except CdrError as e:
+            raise MarchaError(f"annotations: {label!r} at {start} ns: {e}") from None
+        head = np.zeros((), PREFIX)
+        head["opcode"], head["length"], head["channel"] = 5, len(message) + PREFIX.itemsize - 9, channel_id
+        head["sequence"], head["log"], head["publish"] = i, start, start
+        yield start, head.tobytes() + message
+
+
+class EventDecoder:
+    """Decodes annotation messages into ``start_ns, end_ns, label, metadata``; see :class:`~.codec.Decoder`."""
+
+    def __init__(self, library: Library) -> None:
+        self.library = library
+        self.definition = next(iter(library.values()))
+
+    def frame_id(self, message: memoryview) -> str:
+        """Return "": an event has no frame."""
+        return ""
+
+    def decode(self, messages: Messages) -> pl.DataFrame:
+        """Return ``t_ns``, ``t_log_ns`` and the columns of an annotation, one row a message.
+
+        Raises
+        ------
+        CdrError
+            A message does not fit the definition.
+        """
+        rows: list[tuple[int, int, int, int, str, str]] = []
+        for i in range(len(messages.log)):
+            value = decode(messages.message(i), self.definition, self.library)
+            start, end = (value[k]["sec"] * SECOND + value[k]["nanosec"] for k in ("start_time", "end_time"))
+            pairs = {p["key"]: p["value"] for p in value["metadata"]}
+            label = pairs.pop("label", "")
+            text = json.dumps(pairs, ensure_ascii=False, sort_keys=True)
+            rows.append((start, int(messages.log[i]), start, end, label, text))
+        names = {"t_ns": pl.Int64, "t_log_ns": pl.Int64, **{k: v for k, v in COLUMNS.items() if k != "tier"}}
+        return pl.DataFrame(rows, schema=names, orient="row")

@@ -50,7 +50,11 @@ class Layout:
     """
 
     def __init__(
-        self, definition: Definition, library: Library, count_at: Callable[[str, int, bool], int], order: str = "<"
+        self,
+        definition: Definition,
+        library: Library,
+        count_at: Callable[[str, int, bool], int],
+        order: str = "<",
     ) -> None:
         self.order = order
         self.counts: dict[str, int] = {}
@@ -298,7 +302,9 @@ def decode(message: bytes | memoryview, definition: Definition, library: Library
     return _unflatten("", record, definition, library, layout)
 
 
-def _unflatten(prefix: str, record: NDArray[Any], definition: Definition, library: Library, layout: Layout) -> dict:
+def _unflatten(
+    prefix: str, record: NDArray[Any], definition: Definition, library: Library, layout: Layout
+) -> dict:
     out: dict[str, Any] = {}
     for field in definition.fields:
         path = prefix + field.name

@@ -118,7 +118,9 @@ class _Watch:
             if tally.count:
                 yield Finding(kind, tally.count, tally.first, f"{topic}: {text}")
 
-        yield from said("backwards_time", self.backwards, f"time steps back, by up to {self.backwards.worst:.6g} s")
+        yield from said(
+            "backwards_time", self.backwards, f"time steps back, by up to {self.backwards.worst:.6g} s"
+        )
         if self.channel.schema in SAMPLED:
             yield from said("duplicate_time", self.same, "has the time of the row before")
             limit = f"longer than {self.limit_s:.3g} s"
@@ -128,4 +130,6 @@ class _Watch:
         for sensor in dict.fromkeys(name[:-2] for name in self.nonzero if name[:-2] in ("acc", "gyr", "mag")):
             axes = [name for name in self.nonzero if name[:-2] == sensor]
             if not any(self.nonzero[name] for name in axes):
-                yield Finding("all_zero", rows, 1, f"{topic}: every value of {sensor} is 0; is the sensor connected?")
+                yield Finding(
+                    "all_zero", rows, 1, f"{topic}: every value of {sensor} is 0; is the sensor connected?"
+                )

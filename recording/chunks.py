@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
 import numpy as np
 import zstandard
@@ -196,7 +196,10 @@ def _summary(file: FileReader) -> Contents | None:
         return None
     if statistics.message_count and not contents.chunks:
         return None
-    if len(contents.channels) != statistics.channel_count or len(contents.metadata) != statistics.metadata_count:
+    if (
+        len(contents.channels) != statistics.channel_count
+        or len(contents.metadata) != statistics.metadata_count
+    ):
         return None
     if len(contents.attachments) != statistics.attachment_count:
         return None
@@ -353,6 +356,38 @@ def read_chunk(file: FileReader, ref: ChunkRef) -> NDArray[np.uint8]:
     record = file.read(ref.start, ref.length)
     if ref.loose:
         return np.frombuffer(record, "u1")
+    head = chunk_head(record, ref)
+    where, size = f"chunk at byte {ref.start}", head.uncompressed_size
+    body = memoryview(record)[head.start : head.start + head.length]
+    try:
+        data = _decompress(head.compression, body, size)
+    except (zstandard.ZstdError, RuntimeError, MemoryError, ValueError, EOFError) as e:
+        raise ChunkError(f"{where}: {head.compression}: {e}") from None
+    if len(data) != size:
+        raise ChunkError(f"{where}: {len(data)} bytes, {size} stated")
+    if head.crc and zlib.crc32(data) != head.crc:
+        raise ChunkError(f"{where}: the checksum is wrong")
+    return np.frombuffer(data, "u1")
+
+
+class ChunkHead(NamedTuple):
+    """Head of a chunk record; the compressed bytes are ``record[start:start + length]``."""
+
+    uncompressed_size: int
+    crc: int
+    compression: str
+    start: int
+    length: int
+
+
+def chunk_head(record: bytes, ref: ChunkRef) -> ChunkHead:
+    """Parse the head of a chunk record.
+
+    Raises
+    ------
+    ChunkError
+        It is no chunk, or its lengths are wrong.
+    """
     where = f"chunk at byte {ref.start}"
     if len(record) < ref.length or ref.length < 9 + 40 or record[0] != Opcode.CHUNK:
         raise ChunkError(f"{where}: no chunk there")
@@ -362,20 +397,11 @@ def read_chunk(file: FileReader, ref: ChunkRef) -> NDArray[np.uint8]:
     compression = record[at + 4 : at + 4 + name_length].decode("utf-8", "replace")
     at += 4 + name_length
     length = int.from_bytes(record[at : at + 8], "little")
-    body = memoryview(record)[at + 8 : at + 8 + length]
     if at + 8 + length > len(record):
         raise ChunkError(f"{where}: its length is wrong")
     if size > MAX_CHUNK:
         raise ChunkError(f"{where}: claims {size} bytes")
-    try:
-        data = _decompress(compression, body, size)
-    except (zstandard.ZstdError, RuntimeError, MemoryError, ValueError, EOFError) as e:
-        raise ChunkError(f"{where}: {compression}: {e}") from None
-    if len(data) != size:
-        raise ChunkError(f"{where}: {len(data)} bytes, {size} stated")
-    if crc and zlib.crc32(data) != crc:
-        raise ChunkError(f"{where}: the checksum is wrong")
-    return np.frombuffer(data, "u1")
+    return ChunkHead(size, crc, compression, at + 8, length)
 
 
 def _decompress(compression: str, body: memoryview, size: int) -> bytes | memoryview:

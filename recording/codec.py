@@ -15,7 +15,14 @@ from .errors import MarchaError, UsageError
 from .schemas import TECHNOLOGIES, Group, Schema
 
 PREFIX = np.dtype(
-    [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log", "<u8"),
+        ("publish", "<u8"),
+    ]
 )
 """What stands before the message in an MCAP message record: 31 bytes."""
 
@@ -38,7 +45,9 @@ class Binding(NamedTuple):
 # ------------------------------------------------------------------------------------------------ tables to messages
 
 
-def resolve_columns(schema: Schema, columns: Sequence[str], topic: str) -> tuple[tuple[str, ...], list[Group]]:
+def resolve_columns(
+    schema: Schema, columns: Sequence[str], topic: str
+) -> tuple[tuple[str, ...], list[Group]]:
     """Check the columns of a table against a schema.
 
     Returns
@@ -60,14 +69,20 @@ def resolve_columns(schema: Schema, columns: Sequence[str], topic: str) -> tuple
     groups: list[Group] = []
     known: set[str] = set()
     for group in schema.groups:
-        wanted = [n + c.name for c in group.columns for n in names] if schema.names else [c.name for c in group.columns]
+        wanted = (
+            [n + c.name for c in group.columns for n in names]
+            if schema.names
+            else [c.name for c in group.columns]
+        )
         here = given.intersection(wanted)
         known.update(wanted)
         if not here and group.optional:
             continue
         missing = [w for w in wanted if w not in given]
         if missing:
-            raise MarchaError(f"{topic}: {schema.name} lacks the column {', '.join(missing)}; give it, or NaN in it")
+            raise MarchaError(
+                f"{topic}: {schema.name} lacks the column {', '.join(missing)}; give it, or NaN in it"
+            )
         groups.append(group)
     unknown = [c for c in columns if c not in known]
     if unknown:
@@ -86,7 +101,9 @@ def _names_of(schema: Schema, columns: Sequence[str]) -> tuple[str, ...]:
     if first:
         return tuple(c[: -len(first)] for c in columns if c.endswith(first))
     here = set(columns)
-    return tuple(c for c in columns if not any(s and c.endswith(s) and c[: -len(s)] in here for s in suffixes))
+    return tuple(
+        c for c in columns if not any(s and c.endswith(s) and c[: -len(s)] in here for s in suffixes)
+    )
 
 
 class Encoder:
@@ -106,7 +123,9 @@ class Encoder:
         Id that goes into the records.
     """
 
-    def __init__(self, schema: Schema, columns: Sequence[str], frame_id: str, topic: str, channel_id: int) -> None:
+    def __init__(
+        self, schema: Schema, columns: Sequence[str], frame_id: str, topic: str, channel_id: int
+    ) -> None:
         self.schema = schema
         self.topic = topic
         self.channel_id = channel_id
@@ -162,7 +181,11 @@ class Encoder:
         return dtype, record
 
     def encode(
-        self, columns: Mapping[str, NDArray[Any]], t_ns: NDArray[np.int64], t_log_ns: NDArray[np.int64], sequence: int
+        self,
+        columns: Mapping[str, NDArray[Any]],
+        t_ns: NDArray[np.int64],
+        t_log_ns: NDArray[np.int64],
+        sequence: int,
     ) -> tuple[Bytes, NDArray[np.int64]]:
         """Lay a block of rows into message records.
 
@@ -194,7 +217,9 @@ class Encoder:
             rows_of.setdefault(text, []).append(i)
         for text, rows in rows_of.items():
             part = {k: v[rows] for k, v in columns.items()}
-            for i, row in zip(rows, self._encode(text, part, t_ns[rows], t_log_ns[rows], numbers[rows]), strict=True):
+            for i, row in zip(
+                rows, self._encode(text, part, t_ns[rows], t_log_ns[rows], numbers[rows]), strict=True
+            ):
                 records[i] = row.tobytes()
         sizes = np.fromiter(map(len, records), np.int64, n)
         return np.frombuffer(b"".join(records), "u1"), np.cumsum(sizes) - sizes
@@ -254,7 +279,9 @@ class Encoder:
                 return np.square(values) if kind == "sigma" else values
             _refuse(where, of, of.is_integer(), "an integer")
         if series.null_count():
-            raise MarchaError(f"{where}: {series.null_count()} nulls, and {of} has no NaN; drop or fill these rows")
+            raise MarchaError(
+                f"{where}: {series.null_count()} nulls, and {of} has no NaN; drop or fill these rows"
+            )
         if kind == "number":
             return _integers(series.to_numpy(), _field_type(dtype, binding.path), where)
         if kind == "flag":
@@ -266,7 +293,10 @@ class Encoder:
             return np.array([_text(v, where) for v in text.to_list()], object)
         unique = text.unique(maintain_order=True)
         index = pl.DataFrame({"v": text}).join(
-            pl.DataFrame({"v": unique, "i": np.arange(len(unique))}), on="v", how="left", maintain_order="left"
+            pl.DataFrame({"v": unique, "i": np.arange(len(unique))}),
+            on="v",
+            how="left",
+            maintain_order="left",
         )["i"]
         convert = _parse_mac if kind == "mac" else _parse_technology
         codes = np.array([convert(v, where) for v in unique.to_list()], "u1")
@@ -281,7 +311,9 @@ def _refuse(where: str, of: Any, good: bool, wanted: str) -> None:
 def _integers(values: NDArray[Any], field: np.dtype[Any], where: str) -> NDArray[Any]:
     info = np.iinfo(field)
     if len(values) and (values.min() < info.min or values.max() > info.max):
-        raise MarchaError(f"{where}: values {values.min()} to {values.max()}, the field holds {info.min} to {info.max}")
+        raise MarchaError(
+            f"{where}: values {values.min()} to {values.max()}, the field holds {info.min} to {info.max}"
+        )
     return values
 
 
@@ -325,7 +357,9 @@ def check_times(values: NDArray[Any], where: str) -> NDArray[np.int64]:
     """
     if len(values) and (values.min() < 0 or values.max() > MAX_TIME_NS):
         bad = int(np.argmax((values < 0) | (values > MAX_TIME_NS)))
-        raise MarchaError(f"{where}: row {bad}: time {values[bad]} ns; it must lie between 0 and {MAX_TIME_NS}")
+        raise MarchaError(
+            f"{where}: row {bad}: time {values[bad]} ns; it must lie between 0 and {MAX_TIME_NS}"
+        )
     return values.astype(np.int64, copy=False)
 
 
@@ -335,7 +369,10 @@ def record_dtype(layout: Layout) -> np.dtype[Any]:
     prefix = PREFIX.fields or {}
     return np.dtype(
         {
-            "names": [*(f"@{name}" for name in prefix), *fields],  # @: a message may have a field "length" too
+            "names": [
+                *(f"@{name}" for name in prefix),
+                *fields,
+            ],  # @: a message may have a field "length" too
             "formats": [*(f[0] for f in prefix.values()), *(f[0] for f in fields.values())],
             "offsets": [*(f[1] for f in prefix.values()), *(f[1] + PREFIX.itemsize for f in fields.values())],
             "itemsize": PREFIX.itemsize + layout.dtype.itemsize,
@@ -518,7 +555,11 @@ class Plan:
     @property
     def key(self) -> Any:
         """What tells plans of one channel apart."""
-        return (self.layout.key, tuple(self.rows[0]) if self.rows else (), tuple(bytes(v) for _, v in self._constants))
+        return (
+            self.layout.key,
+            tuple(self.rows[0]) if self.rows else (),
+            tuple(bytes(v) for _, v in self._constants),
+        )
 
     def fits(self, block: NDArray[Any]) -> bool:
         """Return whether all messages have this layout and the same frame id and names."""
@@ -526,7 +567,11 @@ class Plan:
 
 
 def _bind(
-    schema: Schema, layout: Layout, record: NDArray[Any], names: tuple[str, ...], columns: tuple[str, ...] | None
+    schema: Schema,
+    layout: Layout,
+    record: NDArray[Any],
+    names: tuple[str, ...],
+    columns: tuple[str, ...] | None,
 ) -> list[Binding]:
     bindings: list[Binding] = []
     for group in schema.groups:
@@ -620,7 +665,9 @@ def _texts(layout: Layout, block: NDArray[Any], path: str) -> pl.Series:
 def _list(layout: Layout, block: NDArray[Any], path: str) -> pl.Series:
     if path not in (block.dtype.names or ()):
         return pl.Series([[]] * len(block), dtype=pl.List(pl.Null))
-    return pl.Series(_number(layout, block, path)).cast(pl.List(pl.Series(_number(layout, block, path)[:1, 0]).dtype))
+    return pl.Series(_number(layout, block, path)).cast(
+        pl.List(pl.Series(_number(layout, block, path)[:1, 0]).dtype)
+    )
 
 
 _READ: dict[str, Any] = {

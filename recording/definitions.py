@@ -170,7 +170,9 @@ def parse_full(name: str, text: str) -> dict[str, Definition]:
     for part in rest:
         head, _, body = part.partition("\n")
         if not head.startswith("MSG:"):
-            raise MarchaError(f"schema {name}: expected 'MSG: package/Name' after the separator, got {head!r}")
+            raise MarchaError(
+                f"schema {name}: expected 'MSG: package/Name' after the separator, got {head!r}"
+            )
         definition = parse(head[4:].strip(), body)
         library[definition.name] = definition
     for definition in list(library.values()):

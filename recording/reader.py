@@ -20,6 +20,7 @@ import polars as pl
 from mcap import records
 from mcap.data_stream import ReadDataStream
 
+from .annotations import COLUMNS, EVENT, TOPIC, EventDecoder
 from .cdr import CdrError
 from .chunks import (
     BROKEN,
@@ -38,7 +39,6 @@ from .errors import Finding, MarchaError, UsageError
 from .schemas import SCHEMAS, Schema
 from .writer import RESERVED
 
-EVENT = "foxglove_msgs/msg/Event"
 _NOW = {"t_ns": pl.Int64, "t_log_ns": pl.Int64}
 
 
@@ -103,14 +103,14 @@ class Message(NamedTuple):
 
 
 @dataclass
-class _Source:
+class Source:
     """What is needed to decode one topic."""
 
     topic: str
     ids: list[int]
     schema: str
     metadata: dict[str, str]
-    decoder: Decoder | None = None
+    decoder: Decoder | EventDecoder | None = None
     declared: tuple[str, ...] | None = None
 
 
@@ -127,38 +127,40 @@ class Recording:
 
     def __init__(self, path: Path | str) -> None:
         self.path = Path(path)
-        self._file = FileReader(self.path)
+        self.file = FileReader(self.path)
         try:
-            self._contents = find_contents(self._file)
+            self.contents = find_contents(self.file)
         except BaseException:
-            self._file.close()
+            self.file.close()
             raise
-        self.findings: list[Finding] = self._contents.findings
+        self.findings: list[Finding] = self.contents.findings
         self._bad: set[int] = set()
-        self._sources = self._make_sources()
+        self.sources = self._make_sources()
         self._tables: dict[str, pl.DataFrame] = {}
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None
+    ) -> None:
         self.close()
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        self.file.close()
 
     # ------------------------------------------------------------------------------------------------ what is inside
 
     @property
     def start_ns(self) -> int:
         """Log time of the first message (0 in an empty recording)."""
-        return min((c.first_ns for c in self._contents.chunks), default=0)
+        return min((c.first_ns for c in self.contents.chunks), default=0)
 
     @property
     def end_ns(self) -> int:
         """Log time of the last message (0 in an empty recording)."""
-        return max((c.last_ns for c in self._contents.chunks), default=0)
+        return max((c.last_ns for c in self.contents.chunks), default=0)
 
     @property
     def duration_s(self) -> float:
@@ -168,24 +170,24 @@ class Recording:
     @property
     def profile(self) -> str:
         """Profile of the MCAP header (``ros2``)."""
-        return self._contents.profile
+        return self.contents.profile
 
     @property
     def library(self) -> str:
         """Program that wrote the file."""
-        return self._contents.library
+        return self.contents.library
 
     @cached_property
     def channels(self) -> dict[str, Channel]:
         """All channels by topic, in the order of their ids."""
         spans = self._spans()
-        return {t: self._describe(s, spans) for t, s in self._sources.items()}
+        return {t: self._describe(s, spans) for t, s in self.sources.items()}
 
     @cached_property
     def metadata(self) -> dict[str, dict[str, str]]:
         """Metadata records: name to its keys and values."""
         out: dict[str, dict[str, str]] = {}
-        for index in self._contents.metadata:
+        for index in self.contents.metadata:
             try:
                 record = records.Metadata.read(self._stream(index.offset, index.length))
             except BROKEN as e:
@@ -197,7 +199,7 @@ class Recording:
     @cached_property
     def attachments(self) -> list[Attachment]:
         """Attached files, without their contents."""
-        return [Attachment(a.name, a.media_type, a.data_size) for a in self._contents.attachments]
+        return [Attachment(a.name, a.media_type, a.data_size) for a in self.contents.attachments]
 
     def attachment(self, name: str) -> bytes:
         """Return the contents of an attachment.
@@ -209,7 +211,7 @@ class Recording:
         MarchaError
             Its record is broken.
         """
-        for index in self._contents.attachments:
+        for index in self.contents.attachments:
             if index.name == name:
                 try:
                     record = records.Attachment.read(self._stream(index.offset, index.length))
@@ -222,9 +224,12 @@ class Recording:
     @cached_property
     def annotations(self) -> pl.DataFrame:
         """Annotations by start time: ``tier, start_ns, end_ns, label, metadata`` (JSON text)."""
-        from .annotations import read_annotations
-
-        return read_annotations(self)
+        parts = [
+            self.table(s.topic).select(pl.lit(s.topic.removeprefix(TOPIC)).alias("tier"), *list(COLUMNS)[1:])
+            for s in self.sources.values()
+            if isinstance(s.decoder, EventDecoder)
+        ]
+        return pl.concat([pl.DataFrame(schema=COLUMNS), *parts]).sort("start_ns", maintain_order=True)
 
     # ------------------------------------------------------------------------------------------------ reading
 
@@ -255,7 +260,7 @@ class Recording:
             The messages are of a kind that marcha cannot read.
         """
         source = self._source(topic)
-        refs = self._refs(set(source.ids), start_ns, end_ns)
+        refs = self.chunk_refs(set(source.ids), start_ns, end_ns)
         parts: list[pl.DataFrame] = []
         with _Pool(len(refs)) as pool:
             for tables in pool.map(lambda ref: self._decode(ref, [source], start_ns, end_ns), refs):
@@ -277,7 +282,7 @@ class Recording:
         Parameters
         ----------
         topics : collection of str, optional
-            Channels to read, default all that can be read.
+            Channels to read, default all that can be read, annotations apart.
         start_ns, end_ns : int, optional
             Half-open range of log time.
         max_rows : int
@@ -289,7 +294,7 @@ class Recording:
         """
         sources = self._select(topics)
         ids = {i for s in sources for i in s.ids}
-        refs = sorted(self._refs(ids, start_ns, end_ns), key=lambda r: (r.first_ns, r.start))
+        refs = sorted(self.chunk_refs(ids, start_ns, end_ns), key=lambda r: (r.first_ns, r.start))
         held: dict[str, list[pl.DataFrame]] = {s.topic: [] for s in sources}
         with _Pool(len(refs)) as pool:
             decoded = pool.map(lambda ref: self._decode(ref, sources, start_ns, end_ns), refs)
@@ -305,10 +310,11 @@ class Recording:
         self, topics: Collection[str] | None = None, start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         """Yield every message in log-time order, ties by channel order; see :meth:`windows`."""
-        order = {t: i for i, t in enumerate(self._sources)}
+        order = {t: i for i, t in enumerate(self.sources)}
         for window in self.windows(topics, start_ns, end_ns):
             streams = [
-                _rows(topic, order[topic], table) for topic, table in sorted(window.tables.items(), key=lambda t: order[t[0]])
+                _rows(topic, order[topic], table)
+                for topic, table in sorted(window.tables.items(), key=lambda t: order[t[0]])
             ]
             for *_, message in heapq.merge(*streams, key=lambda m: m[:3]):
                 yield message
@@ -316,12 +322,12 @@ class Recording:
     # ------------------------------------------------------------------------------------------------ inside
 
     def _stream(self, start: int, length: int) -> ReadDataStream:
-        return ReadDataStream(BytesIO(self._file.read(start + 9, length - 9)))
+        return ReadDataStream(BytesIO(self.file.read(start + 9, length - 9)))
 
-    def _make_sources(self) -> dict[str, _Source]:
-        out: dict[str, _Source] = {}
-        for id_, channel in sorted(self._contents.channels.items()):
-            record = self._contents.schemas.get(channel.schema_id)
+    def _make_sources(self) -> dict[str, Source]:
+        out: dict[str, Source] = {}
+        for id_, channel in sorted(self.contents.channels.items()):
+            record = self.contents.schemas.get(channel.schema_id)
             name = long_name(record.name) if record else ""
             topic = channel.topic
             if topic in out:
@@ -329,8 +335,10 @@ class Recording:
                     out[topic].ids.append(id_)
                     continue
                 topic = f"{channel.topic}#{id_}"
-                add_finding(self.findings, "duplicate_topic", f"{channel.topic}: several channels; read as {topic}")
-            source = _Source(topic, [id_], name, dict(channel.metadata))
+                add_finding(
+                    self.findings, "duplicate_topic", f"{channel.topic}: several channels; read as {topic}"
+                )
+            source = Source(topic, [id_], name, dict(channel.metadata))
             out[topic] = source
             try:
                 source.decoder = self._make_decoder(source, channel, record)
@@ -338,19 +346,28 @@ class Recording:
                 add_finding(self.findings, "unreadable_channel", f"{topic}: {e}; listed, not read")
         return out
 
-    def _make_decoder(self, source: _Source, channel: records.Channel, record: records.Schema | None) -> Decoder:
+    def _make_decoder(
+        self, source: Source, channel: records.Channel, record: records.Schema | None
+    ) -> Decoder | EventDecoder:
         if channel.message_encoding != "cdr":
             raise MarchaError(f"message encoding {channel.message_encoding!r}, only cdr is read")
         known: Schema | None = SCHEMAS.get(source.schema)
-        if record is None or (record.encoding != "ros2msg" and known is None):
-            raise MarchaError(f"schema encoding {record.encoding if record else 'none'!r}, only ros2msg is read")
+        if record is None or (record.encoding != "ros2msg" and known is None and source.schema != EVENT):
+            raise MarchaError(
+                f"schema encoding {record.encoding if record else 'none'!r}, only ros2msg is read"
+            )
         if record.encoding == "ros2msg":
             library = parse_full(record.name, record.data.decode())
             ours = load(source.schema) if known else {}
-            if known and any(library.get(k) is None or library[k].fields != d.fields for k, d in ours.items()):
+            if known and any(
+                library.get(k) is None or library[k].fields != d.fields for k, d in ours.items()
+            ):
                 known = None  # somebody's own message of the same name: take it as it is
         else:
             library = load(source.schema)
+        if source.schema == EVENT and library == load(EVENT):
+            source.declared = tuple(COLUMNS)[1:]
+            return EventDecoder(library)
         text = source.metadata.get("columns")
         if known is not None and text is not None and "frame_id" in source.metadata:
             try:
@@ -359,41 +376,46 @@ class Recording:
                 source.declared = None
         return Decoder(known, library, source.declared)
 
-    def _source(self, topic: str) -> _Source:
-        source = self._sources.get(topic)
+    def _source(self, topic: str) -> Source:
+        source = self.sources.get(topic)
         if source is None:
-            topics = ", ".join(self._sources) or "none"
+            topics = ", ".join(self.sources) or "none"
             raise UsageError(f"{self.path}: no topic {topic!r}; there are: {topics}")
         if source.decoder is None:
-            raise MarchaError(f"{self.path}: {topic}: messages of type {source.schema or 'unknown'} cannot be read")
+            raise MarchaError(
+                f"{self.path}: {topic}: messages of type {source.schema or 'unknown'} cannot be read"
+            )
         return source
 
-    def _select(self, topics: Collection[str] | None) -> list[_Source]:
+    def _select(self, topics: Collection[str] | None) -> list[Source]:
         if topics is None:
-            return [s for s in self._sources.values() if s.decoder is not None]
+            return [s for s in self.sources.values() if isinstance(s.decoder, Decoder)]
         wanted = set([topics] if isinstance(topics, str) else topics)
         for topic in sorted(wanted):
             self._source(topic)
-        return [s for t, s in self._sources.items() if t in wanted]
+        return [s for t, s in self.sources.items() if t in wanted]
 
-    def _refs(self, ids: set[int], start_ns: int | None, end_ns: int | None) -> list[ChunkRef]:
+    def chunk_refs(
+        self, ids: set[int], start_ns: int | None = None, end_ns: int | None = None
+    ) -> list[ChunkRef]:
+        """Return the chunks that may hold messages of these channel ids in a range of log time, in file order."""
         return [
             c
-            for c in self._contents.chunks
+            for c in self.contents.chunks
             if (not c.indexes or ids.intersection(c.indexes))
             and (start_ns is None or c.last_ns >= start_ns)
             and (end_ns is None or c.first_ns < end_ns)
         ]
 
     def _decode(
-        self, ref: ChunkRef, sources: Sequence[_Source], start_ns: int | None, end_ns: int | None
+        self, ref: ChunkRef, sources: Sequence[Source], start_ns: int | None, end_ns: int | None
     ) -> dict[str, pl.DataFrame]:
         """Return the rows of one chunk by topic; a broken chunk gives none and a finding."""
         topic_of = {i: s for s in sources for i in s.ids}
         try:
-            parts = split(read_chunk(self._file, ref), topic_of)
+            parts = split(read_chunk(self.file, ref), topic_of)
         except ChunkError as e:
-            self._lost(ref, str(e))
+            self.lost(ref, str(e))
             return {}
         out: dict[str, pl.DataFrame] = {}
         for id_, messages in sorted(parts.items()):
@@ -407,24 +429,31 @@ class Recording:
             try:
                 table = source.decoder.decode(messages)
             except CdrError as e:
-                self._lost(ref, f"{source.topic}: chunk at byte {ref.start}: {e}")
+                self.lost(ref, f"{source.topic}: chunk at byte {ref.start}: {e}")
                 continue
             out[source.topic] = _join([out[source.topic], table]) if source.topic in out else table
         return out
 
-    def _lost(self, ref: ChunkRef, detail: str) -> None:
+    def lost(self, ref: ChunkRef, detail: str) -> None:
+        """Note that a chunk could not be read."""
         if ref.start not in self._bad:
             self._bad.add(ref.start)
             add_finding(self.findings, "bad_chunk", f"{detail}; skipped")
 
-    def _emit(self, held: dict[str, list[pl.DataFrame]], horizon: int | None, max_rows: int) -> Iterator[Window]:
+    def _emit(
+        self, held: dict[str, list[pl.DataFrame]], horizon: int | None, max_rows: int
+    ) -> Iterator[Window]:
         """Yield what lies before ``horizon`` in windows of ``max_rows``; keep the rest."""
         ready: dict[str, pl.DataFrame] = {}
         for topic, parts in held.items():
             if not parts:
                 continue
             table = _join(parts)
-            at = table.height if horizon is None else int(table["t_log_ns"].search_sorted(horizon, side="left"))
+            at = (
+                table.height
+                if horizon is None
+                else int(table["t_log_ns"].search_sorted(horizon, side="left"))
+            )
             ready[topic] = table.slice(0, at)
             held[topic] = [table.slice(at)] if at < table.height else []
         ready = {t: v for t, v in ready.items() if v.height}
@@ -448,15 +477,20 @@ class Recording:
                     tables[topic] = table.slice(i, j - i)
             yield Window(start, end, tables)
 
-    def _empty(self, source: _Source) -> pl.DataFrame:
+    def _empty(self, source: Source) -> pl.DataFrame:
         columns = self.channels[source.topic].columns
         known = SCHEMAS.get(source.schema)
         kinds = {c.name: c for c in known.columns} if known else {}
-        types: dict[str, Any] = {"number": pl.Float64, "sigma": pl.Float64, "flag": pl.Boolean, "time": pl.Int64}
+        types: dict[str, Any] = {
+            "number": pl.Float64,
+            "sigma": pl.Float64,
+            "flag": pl.Boolean,
+            "time": pl.Int64,
+        }
         schema = {c: types.get(kinds[c].kind, pl.String) if c in kinds else pl.Float64 for c in columns}
         return pl.DataFrame(schema=_NOW | schema)
 
-    def _describe(self, source: _Source, spans: dict[int, tuple[int, int, int]]) -> Channel:
+    def _describe(self, source: Source, spans: dict[int, tuple[int, int, int]]) -> Channel:
         here = [spans[i] for i in source.ids if i in spans]
         count = sum(s[0] for s in here)
         columns, frame_id = source.declared or (), source.metadata.get("frame_id", "")
@@ -473,13 +507,13 @@ class Recording:
             {k: v for k, v in source.metadata.items() if k not in RESERVED},
         )
 
-    def _first(self, source: _Source) -> tuple[tuple[str, ...], str]:
+    def _first(self, source: Source) -> tuple[tuple[str, ...], str]:
         """Return columns and frame id of a foreign channel from its first readable chunk."""
-        for ref in self._refs(set(source.ids), None, None):
+        for ref in self.chunk_refs(set(source.ids)):
             try:
-                parts = split(read_chunk(self._file, ref), source.ids)
+                parts = split(read_chunk(self.file, ref), source.ids)
             except ChunkError as e:
-                self._lost(ref, str(e))
+                self.lost(ref, str(e))
                 continue
             for messages in parts.values():
                 assert source.decoder is not None
@@ -498,10 +532,13 @@ class Recording:
 
         def add(id_: int, count: int, first: int, last: int) -> None:
             old = spans.get(id_)
-            spans[id_] = (count, first, last) if old is None else (
-                old[0] + count, min(old[1], first), max(old[2], last))
+            spans[id_] = (
+                (count, first, last)
+                if old is None
+                else (old[0] + count, min(old[1], first), max(old[2], last))
+            )
 
-        for ref in self._contents.chunks:
+        for ref in self.contents.chunks:
             times = self._times(ref)
             for id_, log in times.items():
                 if len(log):
@@ -511,15 +548,15 @@ class Recording:
     def _times(self, ref: ChunkRef) -> dict[int, Any]:
         if ref.index_length and not ref.loose:
             try:
-                times = read_index(self._file, ref)
+                times = read_index(self.file, ref)
             except ChunkError:
                 times = {}
             if times:
                 return times
         try:
-            return {k: m.log for k, m in split(read_chunk(self._file, ref), None).items()}
+            return {k: m.log for k, m in split(read_chunk(self.file, ref), None).items()}
         except ChunkError as e:
-            self._lost(ref, str(e))
+            self.lost(ref, str(e))
             return {}
 
 

@@ -171,7 +171,14 @@ _ALL = (
                 )
             ),
             Group(
-                (Column("alt_m", "m", "altitude", "height above the WGS 84 ellipsoid (as the device states it)"),),
+                (
+                    Column(
+                        "alt_m",
+                        "m",
+                        "altitude",
+                        "height above the WGS 84 ellipsoid (as the device states it)",
+                    ),
+                ),
                 optional=True,
                 absent={"altitude": _NAN},
             ),
@@ -184,7 +191,12 @@ _ALL = (
             Group(
                 (
                     Column("status", "-", "status.status", "NavSatStatus: -1 no fix, 0 fix, 1 SBAS, 2 GBAS"),
-                    Column("service", "-", "status.service", "NavSatStatus: 1 GPS, 2 GLONASS, 4 BeiDou, 8 Galileo"),
+                    Column(
+                        "service",
+                        "-",
+                        "status.service",
+                        "NavSatStatus: 1 GPS, 2 GLONASS, 4 BeiDou, 8 Galileo",
+                    ),
                 ),
                 optional=True,  # a row of a table of fixes is a fix
             ),
@@ -292,7 +304,9 @@ _ALL = (
         "marcha_msgs/msg/OpticalMarkers",
         "markers of an optical system",
         tuple(
-            Group((Column(f".{a}", "m", f"positions[i].{a}", f"position in frame_id, {a}; NaN where not seen"),))
+            Group(
+                (Column(f".{a}", "m", f"positions[i].{a}", f"position in frame_id, {a}; NaN where not seen"),)
+            )
             for a in "xyz"
         ),
         names="names",
@@ -304,7 +318,11 @@ _ALL = (
             Group((_MAC, Column("rssi_dbm", "dBm", "rssi", "received signal strength"))),
             Group((_TECHNOLOGY,), optional=True),
             Group(
-                (Column("tx_power_dbm", "dBm", "tx_power", "power that the transmitter states (BLE: at 1 m)"),),
+                (
+                    Column(
+                        "tx_power_dbm", "dBm", "tx_power", "power that the transmitter states (BLE: at 1 m)"
+                    ),
+                ),
                 optional=True,
                 absent={"tx_power": _NAN},
             ),
@@ -314,7 +332,11 @@ _ALL = (
                 absent={"frequency": _NAN},
             ),
             Group(
-                (Column("last_seen_ns", "ns", "last_seen", "last heard, by the receiver's own clock", "time"),),
+                (
+                    Column(
+                        "last_seen_ns", "ns", "last_seen", "last heard, by the receiver's own clock", "time"
+                    ),
+                ),
                 optional=True,
             ),
         ),
@@ -325,7 +347,11 @@ _ALL = (
         (
             Group((_MAC, Column("distance_m", "m", "distance", "measured distance"))),
             Group((_TECHNOLOGY,), optional=True),
-            Group((Column("sd_m", "m", "sigma", "its standard deviation"),), optional=True, absent={"sigma": _NAN}),
+            Group(
+                (Column("sd_m", "m", "sigma", "its standard deviation"),),
+                optional=True,
+                absent={"sigma": _NAN},
+            ),
         ),
     ),
 )

@@ -18,11 +18,12 @@ class Selection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     """Options of everything that takes a part of a recording."""
 
     topics: Annotated[
-        tuple[str, ...], msgspec.Meta(description="topics or patterns (/foot/*) ; all where empty")
+        tuple[str, ...], msgspec.Meta(description="topics or patterns (/foot/*); all where empty")
     ] = ()
     start_ns: Annotated[int | None, msgspec.Meta(description="first log time, in the recording's ns")] = None
     end_ns: Annotated[
-        int | None, msgspec.Meta(description="log time at which to stop (not included), in the recording's ns")
+        int | None,
+        msgspec.Meta(description="log time at which to stop (not included), in the recording's ns"),
     ] = None
 
     @property
@@ -39,7 +40,11 @@ def selected_topics(rec: Recording, selection: Selection) -> list[str]:
     UsageError
         A pattern fits no topic of the recording, or the end does not come after the start.
     """
-    if selection.start_ns is not None and selection.end_ns is not None and selection.end_ns <= selection.start_ns:
+    if (
+        selection.start_ns is not None
+        and selection.end_ns is not None
+        and selection.end_ns <= selection.start_ns
+    ):
         raise UsageError(
             f"{rec.path}: nothing lies between {selection.start_ns} ns and {selection.end_ns} ns; "
             "give an end after the start"

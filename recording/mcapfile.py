@@ -1,0 +1,252 @@
+"""An MCAP file being written: records, chunks, indexes, statistics and checksums, on mcap's record classes."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
+
+from .atomic import AtomicFile
+from .cdr import Bytes
+from .errors import UsageError
+
+CHUNK_SIZE = 1 << 20
+"""Uncompressed bytes of a chunk: 30 to 60 s of one 100 Hz channel."""
+
+ZSTD_LEVEL = 3
+
+_QUEUE = 8
+"""Chunks that may wait for a worker: bounds memory."""
+
+
+def library_name() -> str:
+    """Return ``marcha <version>``, as recordings name their writer."""
+    try:
+        return f"marcha {version('marcha')}"
+    except PackageNotFoundError:
+        return "marcha"
+
+
+class Packed(NamedTuple):
+    """A chunk ready for the file: its record, its message indexes, and for each channel where its index
+    starts in them and how many messages it has.
+    """
+
+    chunk: bytes
+    indexes: bytes
+    channels: dict[int, tuple[int, int]]
+    first_ns: int
+    last_ns: int
+    compression: str
+    compressed_size: int
+    uncompressed_size: int
+
+
+class McapFile:
+    """Writes the records of one file in order and keeps account of them for the summary."""
+
+    def __init__(self, path: Path, *, overwrite: bool) -> None:
+        self.path = path
+        self.schemas: dict[tuple[str, str, bytes], Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self._file = AtomicFile(path, overwrite=overwrite)
+        self._statistics = Statistics(0, 0, {}, 0, 0, 0, 0, 0, 0)
+        self._chunks: list[ChunkIndex] = []
+        self._attachments: dict[str, AttachmentIndex] = {}
+        self._metadata: dict[str, MetadataIndex] = {}
+        self._crc = 0
+        self._at = 0
+        self._pool = ThreadPoolExecutor(min(4, os.cpu_count() or 1), thread_name_prefix="marcha-write")
+        self._jobs: deque[Future[Packed]] = deque()
+        try:
+            self._write(MCAP0_MAGIC)
+            self._record(Header(profile="ros2", library=library_name()))
+        except BaseException:
+            self.abort()
+            raise
+
+    def add_schema(self, name: str, encoding: str, data: bytes, id_: int | None = None) -> int:
+        """Write a schema record unless it is there; return its id (``id_`` where that is free)."""
+        key = (name, encoding, data)
+        if key not in self.schemas:
+            taken = {s.id for s in self.schemas.values()}
+            if id_ is None or id_ in taken or id_ == 0:
+                id_ = max(taken, default=0) + 1
+            self.schemas[key] = Schema(id_, data, encoding, name)
+            self._record(self.schemas[key])
+        return self.schemas[key].id
+
+    def free_id(self) -> int:
+        """Return an unused channel id."""
+        return max(self.channels, default=0) + 1
+
+    def add_channel(self, channel: Channel) -> None:
+        """Write a channel record."""
+        self.channels[channel.id] = channel
+        self._statistics.channel_message_counts.setdefault(channel.id, 0)
+        self._record(channel)
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Write a metadata record; one a name."""
+        if name in self._metadata:
+            raise UsageError(f"{self.path}: metadata record {name!r} is there already")
+        start = self._at
+        self._record(Metadata(name, {str(k): str(v) for k, v in values.items()}))
+        self._metadata[name] = MetadataIndex(start, self._at - start, name)
+
+    def add_attachment(self, name: str, data: bytes, media_type: str) -> None:
+        """Write an attachment; one a name."""
+        if name in self._attachments:
+            raise UsageError(f"{self.path}: attachment {name!r} is there already")
+        start = self._at
+        self._record(Attachment(0, 0, name, media_type, data))
+        self._attachments[name] = AttachmentIndex(start, self._at - start, 0, 0, len(data), name, media_type)
+
+    def submit(self, pack: Callable[..., Packed], *args: Any) -> None:
+        """Have ``pack(*args)`` make a chunk in a worker thread; chunks enter the file in the order submitted."""
+        self._jobs.append(self._pool.submit(pack, *args))
+        while len(self._jobs) > _QUEUE:
+            self.put(self._jobs.popleft().result())
+
+    def drain(self) -> None:
+        """Wait for all chunks that were submitted."""
+        while self._jobs:
+            self.put(self._jobs.popleft().result())
+
+    def put(self, packed: Packed) -> None:
+        """Write a chunk and its message indexes."""
+        start = self._at
+        self._write(packed.chunk)
+        index_at = self._at
+        self._write(packed.indexes)
+        self._chunks.append(
+            ChunkIndex(
+                chunk_length=index_at - start,
+                chunk_start_offset=start,
+                compression=packed.compression,
+                compressed_size=packed.compressed_size,
+                message_end_time=packed.last_ns,
+                message_index_length=len(packed.indexes),
+                message_index_offsets={c: index_at + at for c, (at, _) in packed.channels.items()},
+                message_start_time=packed.first_ns,
+                uncompressed_size=packed.uncompressed_size,
+            )
+        )
+        statistics = self._statistics
+        first = statistics.message_count == 0
+        statistics.message_start_time = (
+            packed.first_ns if first else min(statistics.message_start_time, packed.first_ns)
+        )
+        statistics.message_end_time = max(statistics.message_end_time, packed.last_ns)
+        for channel, (_, count) in packed.channels.items():
+            statistics.message_count += count
+            statistics.channel_message_counts[channel] += count
+
+    def finish(self) -> None:
+        """Write the summary and put the file in its place."""
+        self.drain()
+        self._record(DataEnd(self._crc))
+        statistics = self._statistics
+        statistics.schema_count, statistics.channel_count = len(self.schemas), len(self.channels)
+        statistics.attachment_count, statistics.metadata_count = len(self._attachments), len(self._metadata)
+        statistics.chunk_count = len(self._chunks)
+        groups: list[tuple[Opcode, Sequence[McapRecord]]] = [
+            (Opcode.SCHEMA, list(self.schemas.values())),
+            (Opcode.CHANNEL, list(self.channels.values())),
+            (Opcode.STATISTICS, [statistics]),
+            (Opcode.CHUNK_INDEX, self._chunks),
+            (Opcode.ATTACHMENT_INDEX, list(self._attachments.values())),
+            (Opcode.METADATA_INDEX, list(self._metadata.values())),
+        ]
+        builder, start = RecordBuilder(), self._at
+        offsets: list[SummaryOffset] = []
+        for opcode, records in groups:
+            group_start = builder.count
+            for record in records:
+                record.write(builder)
+            if builder.count > group_start:
+                offsets.append(SummaryOffset(opcode, start + group_start, builder.count - group_start))
+        offset_start = start + builder.count
+        for offset in offsets:
+            offset.write(builder)
+        summary = builder.end()
+        head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start)
+        self._write(summary)
+        self._record(Footer(start, offset_start, zlib.crc32(head, zlib.crc32(summary))))
+        self._write(MCAP0_MAGIC)
+        self._file.commit()
+        self._pool.shutdown()
+
+    def abort(self) -> None:
+        """Drop the file; nothing is left on disk."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._file.abort()
+
+    def _record(self, record: McapRecord) -> None:
+        builder = RecordBuilder()
+        record.write(builder)
+        self._write(builder.end())
+
+    def _write(self, data: bytes | memoryview) -> None:
+        self._file.write(data)
+        self._crc = zlib.crc32(data, self._crc)
+        self._at += len(data)
+
+
+def pack(data: Bytes, channel_id: int, log: NDArray[np.int64], offsets: NDArray[np.int64]) -> Packed:
+    """Compress message records of one channel into a chunk and build its message index.
+
+    Parameters
+    ----------
+    data : ndarray of uint8
+        Message records, one behind the other.
+    channel_id : int
+        Their channel.
+    log, offsets : ndarray of int64, shape (n,)
+        Log time and first byte of every record.
+    """
+    raw = memoryview(data)
+    compressed = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(raw)
+    first, last = int(log.min()), int(log.max())
+    chunk = RecordBuilder()
+    Chunk("zstd", compressed, last, first, zlib.crc32(raw), data.size).write(chunk)
+    entries = np.empty((len(log), 2), "<u8")
+    entries[:, 0] = log
+    entries[:, 1] = offsets
+    index = RecordBuilder()  # MessageIndex.write would loop over tuples
+    index.start_record(Opcode.MESSAGE_INDEX)
+    index.write2(channel_id)
+    index.write4(entries.nbytes)
+    index.write(entries.tobytes())
+    index.finish_record()
+    channels = {channel_id: (0, len(log))}
+    return Packed(chunk.end(), index.end(), channels, first, last, "zstd", len(compressed), data.size)
