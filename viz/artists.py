@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import rerun as rr
 
-from ..recording.schemas import SCHEMAS
+from ..recording import SCHEMAS
 from . import style
 from .scene import ChannelLike, Floats, Scene, Threshold, Times, columns_of, is_estimate, thresholds_of
 from .track import Track
@@ -38,15 +38,6 @@ class Artist:
     def end(self) -> None:
         """Log what needs the whole."""
 
-    def lines(self, path: str, names: Sequence[str], colors: Sequence[str], width: float = 1.5) -> None:
-        """Style lines: one name and colour a column of the entity."""
-        self.scene.static(
-            path,
-            rr.SeriesLines(
-                names=list(names), colors=[style.rgb(c) for c in colors], widths=[width] * len(names)
-            ),
-        )
-
     def scalars(self, path: str, t_ns: Times, values: Floats) -> None:
         """Log (n,) or (n, k) values; a block without any finite value is left out."""
         if np.isfinite(values).any():
@@ -54,9 +45,10 @@ class Artist:
 
     def limit(self, path: str, limit: Threshold, unit: str = "") -> None:
         """Log a horizontal line below an entity, over the whole time seen."""
-        entity = f"{path}/threshold/{limit.name}"
-        name = limit.name.replace("_", " ")
-        self.lines(entity, [f"threshold {name} = {limit.value:g}{unit}"], [style.THRESHOLD])
+        # two runs may limit one statistic differently
+        entity = f"{path}/threshold/{limit.name}_{limit.value:g}"
+        word = "min" if limit.name.endswith(".min") else "max"
+        self.scene.lines(entity, [f"{word} {limit.value:g}{unit}"], [style.THRESHOLD])
         span = self.scene.span()
         self.scalars(entity, span, np.full(span.size, limit.value))
 
@@ -72,7 +64,7 @@ class Numbers(Artist):
         ]
         shown = [shown_as(c, known[c].unit if c in known else "") for c in self.names]
         self.factors = [s.factor for s in shown]
-        self.lines(self.path, [s.name for s in shown], [style.axis_color(i) for i in range(len(shown))])
+        self.scene.lines(self.path, [s.name for s in shown], [style.axis_color(i) for i in range(len(shown))])
         role = "other" if is_estimate(self.channel.topic) else "raw"
         self.scene.show(role, self.owner, f"{self.owner} {self.what}" if role == "other" else self.owner, self.path)
 
@@ -92,8 +84,8 @@ class Imu(Artist):
         ]
         for key, title, unit in self.sensors:
             path = f"{self.path}/{key}"
-            self.lines(path, [f"{key} {a} ({unit})" for a in "xyz"], style.AXES)
-            self.lines(f"{path}_norm", [f"‖{key}‖ {self.owner} ({unit})"], [style.NORM])
+            self.scene.lines(path, [f"{key} {a} ({unit})" for a in "xyz"], style.AXES)
+            self.scene.lines(f"{path}_norm", [f"‖{key}‖ ({unit})"], [style.NORM])
             self.scene.show("raw", self.owner, f"{self.owner} {title} ({unit})", path)
             self.scene.show("norm", self.owner, f"{self.owner} norm of the {title} ({unit})", f"{path}_norm")
 
@@ -115,9 +107,9 @@ class Velocity(Artist):
 
     def begin(self) -> None:
         self.names = list(self.channel.columns[:3])
-        self.lines(self.path, [f"{self.owner} velocity {a} (m/s)" for a in "xyz"], style.AXES)
+        self.scene.lines(self.path, [f"velocity {a} (m/s)" for a in "xyz"], style.AXES)
         self.speed = f"{self.parent}/speed"
-        self.lines(self.speed, [f"{self.owner} speed (m/s)"], [self.color])
+        self.scene.lines(self.speed, [self.owner], [self.color])
         self.scene.show("velocity", self.owner, f"{self.owner} velocity (m/s)", self.path)
         self.scene.show("speed", self.owner, "speed (m/s)", self.speed)
 
@@ -138,9 +130,9 @@ class Pose(Artist):
         self.base = self.parent if self.what == "pose" else self.path
         self.track = self.scene.tracks[self.base] = Track(self.owner, self.color)
         self.zero: Floats | None = None
-        self.lines(f"{self.base}/height", [f"{self.owner} height (m)"], [self.color])
+        self.scene.lines(f"{self.base}/height", [self.owner], [self.color])
         self.scene.static(
-            f"{self.base}/trail", rr.Points3D.from_fields(colors=style.rgb(self.color), radii=rr.Radius.ui_points(2.5))
+            f"{self.base}/trail", rr.Points3D.from_fields(colors=style.rgb(self.color), radii=rr.Radius.ui_points(2.0))
         )
         self.turns = set(self.QUATERNION) <= set(self.channel.columns)
         if self.turns:
@@ -180,11 +172,12 @@ class Pose(Artist):
         owners = list(self.scene.tracks)
         # names stand at different places of the walk, so that those of several runs do not cover each other
         at = len(line) * (owners.index(self.base) + 1) // (len(owners) + 1)
+        first = owners[0] == self.base
         self.scene.static(
             f"{self.base}/mark",
             rr.Points3D(
                 line[[0, at, -1]],
-                labels=["start", self.owner, "end"] if len(owners) == 1 else ["", self.owner, "end"],
+                labels=["start" if first else "", self.owner, "end" if first else ""],
                 colors=color,
                 radii=rr.Radius.ui_points([5.0, 0.0, 5.0]),
                 show_labels=True,
@@ -201,8 +194,8 @@ class Stance(Artist):
             self.path,
             rr.StateConfiguration(
                 values=["still", "moving"],
-                labels=["still", "moving"],
-                colors=[(*style.rgb(style.STILL), 255), (*style.rgb(style.MOVING), 255)],
+                labels=["still", ""],  # a swing is too short for a word
+                colors=[(*style.rgb(style.STILL), 255), (*style.rgb(style.MOVING), 80)],
             ),
         )
         self.scene.show("stance", self.owner, "stance", self.path)
@@ -228,7 +221,7 @@ class Values(Artist):
         role = "detector" if self.what == "detector" else "other"
         for name, shown in self.shown.items():
             path = f"{self.path}/{name}"
-            self.lines(path, [f"{self.owner} {shown.name}"], [self.color])
+            self.scene.lines(path, [shown.name], [self.color])
             self.scene.show(role, self.owner, f"{self.owner}: {shown.name}", path)
 
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
@@ -277,7 +270,7 @@ class Steps(Artist):
         self.waiting = np.empty(0, dtype=np.int64)
         color = style.rgb(self.color)
         self.scene.static(
-            self.path, rr.SeriesPoints(names=f"{self.owner} step length (m)", colors=color, markers="circle", marker_sizes=3.0)
+            self.path, rr.SeriesPoints(names=self.owner, colors=color, markers="circle", marker_sizes=3.0)
         )
         self.prints = f"{self.parent}/footprints"
         self.scene.static(self.prints, rr.Points3D.from_fields(colors=color, radii=rr.Radius.ui_points(5.0)))
@@ -331,7 +324,7 @@ class Fix(Artist):
 
 
 class Nothing(Artist):
-    """A channel without a picture (radio addresses, frames)."""
+    """A channel without a picture of its own (radio addresses, frames)."""
 
 
 def shown_as(column: str, unit: str = "") -> style.Column:
@@ -353,6 +346,7 @@ ARTISTS: dict[str, type[Artist]] = {
     "marcha_msgs/msg/Ranging": Nothing,
     "geometry_msgs/msg/TransformStamped": Nothing,
     "tf2_msgs/msg/TFMessage": Nothing,
+    "foxglove_msgs/msg/Event": Nothing,  # drawn from the recording's table of annotations
 }
 """By message type; every other one is drawn as numbers."""
 

@@ -205,11 +205,12 @@ def _compare(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Container
 
 
 def _report(entries: Sequence[Entry]) -> rrb.Container:
-    document = rrb.TextDocumentView(origin="/report", contents="$origin/**", name="report")
+    reports = [rrb.TextDocumentView(origin=e.path, contents=[e.path], name=e.title) for e in _of(entries, "report")]
+    documents = reports[0] if len(reports) == 1 else rrb.Tabs(*reports)
     events = [e.path for e in _of(entries, "log")]
     if not events:
-        return rrb.Vertical(document, name="Report")
+        return rrb.Vertical(documents, name="Report")
     log = rrb.TextLogView(origin="/", contents=events, name="steps and annotations")
-    return rrb.Horizontal(document, log, column_shares=[3, 2], name="Report")
+    return rrb.Horizontal(documents, log, column_shares=[3, 2], name="Report")
 
 

@@ -34,7 +34,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from . import style
-from .track import Track, align
+from .track import Track, compare
 
 if TYPE_CHECKING:
     from .artists import Artist
@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 TIMELINE = "time"
 BLOCK_ROWS = 1000
 """Rows a block: small enough for bounded memory, large enough for speed (measured: 2.5 million rows/s)."""
+
+ALIGNMENT = "se2"
+"""A strapdown estimate knows the vertical but neither its first heading nor its place: only those are taken out."""
 
 FAR_M = 1e4
 """Positions farther from zero than this are logged relative to a local origin: Rerun's 3D is float32."""
@@ -129,7 +132,7 @@ class Threshold:
     statistic : str
         The column that it limits.
     name : str
-        What the metadata calls it, for example ``acc_norm_min``.
+        What the metadata calls it, for example ``acc_norm.min``.
     value : float
         In the statistic's unit.
     """
@@ -154,6 +157,8 @@ class Scene:
         Entity path before everything, for example ``/walk1`` where several recordings are shown together.
     first_color : int
         Number of runs drawn before in the same view, so that no two runs have one colour.
+    alignment : str
+        How tracks are laid upon the reference; see :func:`marcha.replay.alignment.align`.
     """
 
     def __init__(
@@ -163,10 +168,12 @@ class Scene:
         clock: Clock,
         prefix: str = "",
         first_color: int = 0,
+        alignment: str = ALIGNMENT,
     ) -> None:
         from .artists import artist_of
 
         self.stream, self.clock, self.prefix = stream, clock, prefix.rstrip("/")
+        self.alignment = alignment
         self.entries: list[Entry] = []
         self.rows = 0
         self.tracks: dict[str, Track] = {}
@@ -194,7 +201,10 @@ class Scene:
     def owner(self, topic: str) -> str:
         """Return what a legend calls the channel's owner: the run, ``reference``, or the topic."""
         parts = topic.split("/")
-        name = parts[2] if is_estimate(topic) else "reference" if parts[1] == "reference" else topic
+        if is_estimate(topic):
+            name = parts[2]
+        else:  # "/reference/imu2/pose" belongs to "reference imu2"
+            name = " ".join(parts[1:-1]) if parts[1] == "reference" else topic
         return f"{self.prefix[1:]} {name}".strip()
 
     def show(self, role: str, owner: str, title: str, path: str) -> None:
@@ -209,6 +219,11 @@ class Scene:
         return self._origin if near else np.round(first)
 
     # -- logging
+
+    def lines(self, path: str, names: Sequence[str], colors: Sequence[str], width: float = 1.5) -> None:
+        """Style lines: one name and colour a column of the entity."""
+        rgb = [style.rgb(c) for c in colors]
+        self.static(path, rr.SeriesLines(names=list(names), colors=rgb, widths=[width] * len(names)))
 
     def static(self, path: str, *archetypes: Any) -> None:
         """Log something that holds at all times."""
@@ -225,6 +240,31 @@ class Scene:
         self.static(self.prefix or "/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         for artist in self.artists.values():
             artist.begin()
+        self.show("report", self.prefix[1:], self.prefix[1:] or "report", f"{self.prefix}/report")
+
+    def annotate(self, annotations: pl.DataFrame) -> None:
+        """Draw labelled intervals (``tier, start_ns, end_ns, label``): a lane and lines in the log for each tier.
+
+        Stances and steps that a replay wrote are left out: the run's own channels show them.
+        """
+        for (tier,), rows in annotations.group_by("tier", maintain_order=True):
+            if str(tier).rpartition("/")[0] in self.runs:
+                continue
+            path, log = f"{self.prefix}/annotation/{tier}", f"{self.prefix}/log/annotation/{tier}"
+            rows = rows.sort("start_ns")
+            start, end, labels = rows["start_ns"].to_numpy(), rows["end_ns"].to_numpy(), rows["label"].to_list()
+            # an interval that another one follows at once needs no gap between them
+            gap = np.flatnonzero(~np.isin(end, start))
+            times = np.concatenate([start, end[gap]])
+            states = [*labels, *[""] * len(gap)]
+            order = np.argsort(times, kind="stable")
+            self.columns(path, times[order], rr.StateChange.columns(state=[states[i] for i in order]))
+            text = [
+                f"{tier}: {label}, {(b - a) / 1e9:.2f} s" for label, a, b in zip(labels, start, end, strict=True)
+            ]
+            self.columns(log, start, rr.TextLog.columns(text=text, level=["INFO"] * len(text)))
+            self.show("annotation", str(tier), str(tier), path)
+            self.show("log", str(tier), str(tier), log)
 
     def write(self, topic: str, table: pl.DataFrame) -> None:
         """Draw rows of one channel (``t_ns`` and its columns)."""
@@ -246,38 +286,26 @@ class Scene:
 
     def _compare(self) -> None:
         """Turn every run's track onto the reference and log its error over time."""
-        reference = next((t for g, t in self.tracks.items() if "/reference" in g and t.count > 1), None)
+        reference = self.tracks.get(f"{self.prefix}/reference") or next(
+            (t for g, t in self.tracks.items() if g.startswith(f"{self.prefix}/reference/") and t.count > 1), None
+        )
         if reference is None:
             return
         for path, track in self.tracks.items():
-            if track is reference or "/run/" not in path:
-                continue
-            found = align(track, reference)
+            found = compare(track, reference, self.alignment) if "/run/" in path else None
             if found is None:
                 continue
-            track.rotation, track.translation = found.rotation, found.translation
+            track.place = found.place
             self.static(
-                path, rr.Transform3D(translation=found.translation, mat3x3=found.rotation)
+                path, rr.Transform3D(translation=found.place.translation, mat3x3=found.place.rotation)
             )
-            axes = f"{path}/error"
-            self.static(
-                axes,
-                rr.SeriesLines(
-                    names=[f"{track.owner} error {a} (m)" for a in "xyz"],
-                    colors=[style.rgb(c) for c in style.AXES],
-                    widths=[1.5] * 3,
-                ),
-            )
-            self.columns(axes, found.t_ns, rr.Scalars.columns(scalars=found.error))
-            self.show("error", track.owner, f"{track.owner}: error and ±1σ (m)", axes)
-            distance = f"{path}/distance"
-            self.static(
-                distance,
-                rr.SeriesLines(
-                    names=f"{track.owner} distance to the reference (m)", colors=style.rgb(track.color), widths=1.5
-                ),
-            )
+            error, distance = f"{path}/error", f"{path}/distance"
+            names = [f"error {a} (m)" for a in "xyz"]
+            self.lines(error, names, style.AXES)
+            self.lines(distance, [f"{track.owner} distance (m)"], [track.color])
+            self.columns(error, found.t_ns, rr.Scalars.columns(scalars=found.error))
             self.columns(distance, found.t_ns, rr.Scalars.columns(scalars=np.linalg.norm(found.error, axis=1)))
+            self.show("error", track.owner, f"error after alignment {self.alignment} (m)", error)
             self.show("distance", track.owner, "distance to the reference (m)", distance)
 
     def extents(self) -> list[Floats]:
@@ -297,7 +325,7 @@ def is_estimate(topic: str) -> bool:
 
 
 def thresholds_of(channel: ChannelLike) -> Iterator[Threshold]:
-    """Read ``threshold.<name> = value`` from a channel's metadata; the name begins with the statistic's."""
+    """Read ``threshold.<statistic>`` and ``threshold.<statistic>.min`` (a floor) from a channel's metadata."""
     for key, text in channel.metadata.items():
         name = key.removeprefix("threshold.")
         if name == key:
@@ -306,8 +334,7 @@ def thresholds_of(channel: ChannelLike) -> Iterator[Threshold]:
             value = float(text)
         except ValueError:
             continue  # a rule in words has no line
-        statistic = max((c for c in channel.columns if name.startswith(c)), key=len, default=name)
-        yield Threshold(statistic, name, value)
+        yield Threshold(name.partition(".")[0], name, value)
 
 
 def columns_of(table: pl.DataFrame, names: Sequence[str], factors: Sequence[float] = ()) -> Floats:

@@ -84,7 +84,7 @@ def screenshots(
             client.set_time(TIMELINE, duration=np.timedelta64(cursor, "ns"), play_state="paused")
         pictures = []
         for tab in tabs:
-            _show_tab(client, tab, path)
+            _show_tab(client, tab, path, patience_s)
             time.sleep(SETTLE_S)
             png = client.take_screenshot()
             reports = tuple(
@@ -105,17 +105,34 @@ def _loaded(client: Any, path: Path, patience_s: float) -> Any:
     raise MarchaError(f"{path}: the viewer had not loaded it after {patience_s:g} s")
 
 
-def _show_tab(client: Any, name: str, path: Path) -> None:
+def _show_tab(client: Any, name: str, path: Path, patience_s: float) -> None:
     """Bring a tab of the outermost container to the front, and hide the viewer's own menu."""
     layout = client.get_blueprint(of="recording").blueprint
-    containers = {k: v["ContainerBlueprint"] for k, v in layout.items() if "ContainerBlueprint" in v}
+    containers = {
+        k.lstrip("/"): v["ContainerBlueprint"] for k, v in layout.items() if "ContainerBlueprint" in v
+    }
     found = next((k for k, c in containers.items() if c.get("display_name") == name), None)
     if found is None:
         names = sorted({c["display_name"] for c in containers.values() if "display_name" in c})
         raise MarchaError(f"{path}: no tab {name!r}; it has {', '.join(names)}")
-    for key, container in containers.items():
-        contents = container.get("contents", [])
-        if container["container_kind"] == "Tabs" and found.lstrip("/") in contents:
-            layout[key]["ContainerBlueprint"]["active_tab"] = found.lstrip("/")
+    outer = next(k for k, c in containers.items() if c["container_kind"] == "Tabs" and found in _contents(c))
+    containers[outer]["active_tab"] = found
     layout["/top_panel"] = {"PanelBlueprint": {"state": "Hidden"}}
     client.set_blueprint(layout, of="recording")
+    # the viewer shows it some frames later: views of hidden tabs have no picture
+    part = found
+    while part in containers:
+        part = _contents(containers[part])[0]
+    until = time.monotonic() + patience_s
+    while True:
+        try:
+            client.take_screenshot(part.removeprefix("view/"))
+            return
+        except RuntimeError:
+            if time.monotonic() > until:
+                raise MarchaError(f"{path}: the viewer did not show the tab {name!r}") from None
+
+
+def _contents(container: dict[str, Any]) -> list[str]:
+    found = container.get("contents", [])
+    return [found] if isinstance(found, str) else found

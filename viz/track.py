@@ -1,4 +1,4 @@
-"""A track kept small enough for any length, and its rigid alignment with a reference."""
+"""A track kept small enough for any length, and its comparison with a reference."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ..replay.alignment import Transform, align, match
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -23,13 +25,13 @@ class Track:
         What a legend calls it, and its colour.
     seen, count : int
         Points taken and points kept so far.
-    rotation, translation : ndarray
-        (3, 3) and (3,): how the positions are turned and moved before they are shown.
+    place : Transform
+        How the positions are turned and moved before they are shown.
     """
 
     def __init__(self, owner: str, color: str) -> None:
         self.owner, self.color = owner, color
-        self.rotation, self.translation = np.eye(3), np.zeros(3)
+        self.place = Transform(np.eye(3), np.zeros(3))
         self._t: list[Times] = []
         self._p: list[Floats] = []
         self._stride, self.seen, self.count = 1, 0, 0
@@ -51,7 +53,7 @@ class Track:
     @property
     def shown(self) -> Floats:
         """Positions (n, 3) as they are shown, m."""
-        return self.positions @ self.rotation.T + self.translation
+        return self.place.points(self.positions)
 
     @property
     def last_ns(self) -> int:
@@ -76,48 +78,47 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Aligned:
-    """A track turned about the vertical and moved onto a reference.
+class Compared:
+    """A track laid upon a reference.
 
     Attributes
     ----------
-    rotation, translation : ndarray
-        (3, 3) and (3,): ``reference ≈ rotation @ track + translation``.
+    place : Transform
+        From the track's coordinates to the reference's.
     t_ns : ndarray
-        Times (n,) of the track within the reference.
+        Times (n,) of the track that have a partner.
     error : ndarray
         (n, 3), m: aligned track minus reference, in the track's own axes (those of its sigma).
     """
 
-    rotation: Floats
-    translation: Floats
+    place: Transform
     t_ns: Times
     error: Floats
 
 
-def align(track: Track, reference: Track) -> Aligned | None:
-    """Return the least-squares rotation about the vertical and translation onto the reference.
+def compare(track: Track, reference: Track, alignment: str, max_gap_s: float = 1.0) -> Compared | None:
+    """Match a track with a reference in time, align it, and return its error.
 
-    A strapdown estimate knows the vertical but neither its first heading nor its place: those four degrees of freedom, and
-    no others, are taken out (Horn 1987, closed form for one axis). The reference is interpolated linearly at
-    the track's times.
+    Parameters
+    ----------
+    track, reference : Track
+        Positions in metres.
+    alignment : str
+        See :func:`marcha.replay.alignment.align`.
+    max_gap_s : float
+        The reference is not interpolated over longer gaps.
 
     Returns
     -------
-    Aligned or None
-        None where fewer than two points overlap in time.
+    Compared or None
+        None where fewer than two times have a partner.
     """
-    t_ref, t_ns = reference.t_ns, track.t_ns
-    inside = (t_ns >= t_ref[0]) & (t_ns <= t_ref[-1])
-    t_ns, p = t_ns[inside], track.positions[inside]
-    if len(t_ns) < 2:
+    t_ref, once = np.unique(reference.t_ns, return_index=True)
+    order = np.argsort(track.t_ns, kind="stable")
+    t_ns = track.t_ns[order]
+    found = match(t_ns, t_ref, max_gap_s)
+    if len(found.index) < 2:
         return None
-    q = reference.at(t_ns)
-    p0, q0 = p - p.mean(axis=0), q - q.mean(axis=0)
-    yaw = np.arctan2(
-        np.sum(p0[:, 0] * q0[:, 1] - p0[:, 1] * q0[:, 0]), np.sum(p0[:, 0] * q0[:, 0] + p0[:, 1] * q0[:, 1])
-    )
-    c, s = np.cos(yaw), np.sin(yaw)
-    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    translation = q.mean(axis=0) - rotation @ p.mean(axis=0)
-    return Aligned(rotation, translation, t_ns, (p @ rotation.T + translation - q) @ rotation)
+    p, q = track.positions[order][found.index], found.linear(reference.positions[once])
+    place = align(p, q, alignment)
+    return Compared(place, t_ns[found.index], (place.points(p) - q) @ place.rotation)

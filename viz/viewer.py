@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from typing import Self
+from urllib.parse import quote
 
 from ..recording.errors import MarchaError, UsageError
 
@@ -41,11 +42,13 @@ class Viewer:
     Attributes
     ----------
     port : int
-        Where it listens: for data (native) or for browsers (web).
+        Where it listens for data.
+    address : str
+        What to open in a browser; empty for the native viewer.
     """
 
-    def __init__(self, arguments: Sequence[str], port: int) -> None:
-        self.port = port
+    def __init__(self, arguments: Sequence[str], port: int, address: str = "") -> None:
+        self.port, self.address = port, address
         self._said = tempfile.TemporaryFile()
         self._process = subprocess.Popen(
             [sys.executable, "-m", "rerun_cli", *arguments],
@@ -100,7 +103,7 @@ class Viewer:
         self.close()
 
 
-def native(*, port: int | None = None, headless: bool = False, size: tuple[int, int] | None = None) -> Viewer:
+def native(*, headless: bool = False, size: tuple[int, int] | None = None) -> Viewer:
     """Start the native viewer, waiting for data on a port of its own.
 
     Raises
@@ -110,31 +113,25 @@ def native(*, port: int | None = None, headless: bool = False, size: tuple[int, 
     MarchaError
         It did not start.
     """
-    if not headless and sys.platform.startswith("linux"):
-        if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-            raise UsageError("no display for the viewer; use --web, or --rrd FILE and open that file elsewhere")
-    port = port or free_port()
+    display = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if not headless and sys.platform.startswith("linux") and not display:
+        raise UsageError("no display for the viewer; use --web, or --rrd FILE and open that file elsewhere")
+    port = free_port()
     flags = ["--headless"] if headless else ["--expect-data-soon"]
     if size is not None:
         flags += ["--window-size", f"{size[0]}x{size[1]}"]
     return Viewer(["--bind", HOST, "--port", str(port), "--hide-welcome-screen", *flags], port)
 
 
-def web(source: str, *, port: int | None = None, open_browser: bool = True) -> Viewer:
-    """Start the web viewer for a stream that listens at ``source``; it serves browsers of this machine.
+def web(*, open_browser: bool = True) -> Viewer:
+    """Start the web viewer, waiting for data on a port of its own; it serves browsers of this machine.
 
     Raises
     ------
     MarchaError
         It did not start.
     """
-    port = port or free_port()
+    port, page = free_port(), free_port()
     mode = "--web-viewer" if open_browser else "--serve-web"
-    return Viewer([source, mode, "--bind", HOST, "--web-viewer-port", str(port)], port)
-
-
-def web_address(viewer: Viewer, source: str) -> str:
-    """Return what to open in a browser."""
-    from urllib.parse import quote
-
-    return f"http://{HOST}:{viewer.port}?url={quote(source, safe='')}"
+    arguments = [mode, "--bind", HOST, "--port", str(port), "--web-viewer-port", str(page)]
+    return Viewer(arguments, port, f"http://{HOST}:{page}?url={quote(uri(port), safe='')}")

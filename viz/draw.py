@@ -1,0 +1,129 @@
+"""Recordings into one Rerun stream: which clock, which colours, in which order."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import polars as pl
+import rerun as rr
+
+from ..recording import Recording
+from ..recording.atomic import AtomicFile
+from ..recording.errors import MarchaError
+from .blueprint import blueprint
+from .report import report
+from .scene import Clock, Scene
+
+APPLICATION = "marcha"
+
+EPOCH_NS = 10**17
+"""Times below this (March 1973) cannot be the epoch's: they count from a device's own zero."""
+
+
+def new_stream() -> rr.RecordingStream:
+    """Return a stream with the one time line of the recordings and nothing of Rerun's own."""
+    stream = rr.RecordingStream(APPLICATION)
+    stream.set_log_time_enabled(False)
+    stream.set_log_tick_enabled(False)
+    return stream
+
+
+def clock_of(recs: Sequence[Recording]) -> list[Clock]:
+    """Return the clock of every recording.
+
+    One recording keeps its own time. Several that overlap in time share it; several of different days are laid on each
+    other, each from its own start, or their plots would be points in an empty year.
+    """
+    starts, ends = [rec.start_ns or 0 for rec in recs], [rec.end_ns or 0 for rec in recs]
+    clocks = [
+        clock_from(start, rec.metadata.get("device", {}).get("clock", ""))
+        for rec, start in zip(recs, starts, strict=True)
+    ]
+    if len(set(clocks)) == 1 and max(starts) <= min(ends):
+        return clocks
+    return [Clock("duration", start) for start in starts]
+
+
+def clock_from(t_ns: int, said: str = "") -> Clock:
+    """Return the clock of a recording that begins at ``t_ns``; ``said`` is what its metadata calls its clock."""
+    if said == "device" or (not said and t_ns < EPOCH_NS):
+        return Clock("duration")
+    return Clock("timestamp")
+
+
+def draw(
+    recs: Sequence[Recording],
+    stream: rr.RecordingStream,
+    *,
+    topics: Sequence[Sequence[str]] | None = None,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+) -> list[Scene]:
+    """Log recordings, their reports and the blueprint into a stream that has its sinks.
+
+    Parameters
+    ----------
+    recs : sequence of Recording
+        One, or several to be shown together.
+    stream : rerun.RecordingStream
+        Where to log.
+    topics : sequence of sequence of str, optional
+        Topics of each recording; all by default.
+    start_ns, end_ns : int, optional
+        Range of log times, half open.
+
+    Returns
+    -------
+    list of Scene
+        One a recording.
+    """
+    stream.send_recording_name(", ".join(rec.path.stem for rec in recs))
+    prefixes = [""] if len(recs) == 1 else prefixes_of(recs)
+    scenes: list[Scene] = []
+    for i, (rec, clock, prefix) in enumerate(zip(recs, clock_of(recs), prefixes, strict=True)):
+        chosen = list(topics[i]) if topics is not None else list(rec.channels)
+        channels = [rec.channels[t] for t in chosen]
+        scene = Scene(stream, channels, clock, prefix, first_color=sum(len(s.runs) or 1 for s in scenes))
+        scene.begin()
+        for window in rec.windows(chosen, start_ns=start_ns, end_ns=end_ns):
+            for topic, table in window.tables.items():
+                scene.write(topic, table)
+        scene.annotate(_within(rec.annotations, start_ns, end_ns))
+        scene.end()
+        text = rr.TextDocument(report(rec), media_type=rr.MediaType.MARKDOWN)
+        scene.static(f"{scene.prefix}/report", text)
+        scenes.append(scene)
+    stream.send_blueprint(blueprint(scenes))
+    return scenes
+
+
+def check_whole(file: AtomicFile) -> None:
+    """Make sure that a written ``.rrd`` ends as it should: Rerun only logs what its file sink cannot write.
+
+    Raises
+    ------
+    MarchaError
+        It does not; nothing is left.
+    """
+    from rerun.chunk import RrdReader
+
+    try:
+        RrdReader(file.part).store()
+    except Exception as error:
+        file.abort()
+        reason = str(error).splitlines()[0]
+        raise MarchaError(f"{file.path}: not written whole (is the disk full?): {reason}") from None
+
+
+def prefixes_of(recs: Sequence[Recording]) -> list[str]:
+    """Return one entity prefix a recording: its file's name, numbered where two are alike."""
+    names = [rec.path.stem for rec in recs]
+    return [f"/{n}" if names.count(n) == 1 else f"/{n}-{names[: i + 1].count(n)}" for i, n in enumerate(names)]
+
+
+def _within(annotations: pl.DataFrame, start_ns: int | None, end_ns: int | None) -> pl.DataFrame:
+    if start_ns is not None:
+        annotations = annotations.filter(pl.col("end_ns") >= start_ns)
+    if end_ns is not None:
+        annotations = annotations.filter(pl.col("start_ns") < end_ns)
+    return annotations

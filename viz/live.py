@@ -1,0 +1,191 @@
+"""Views that open: a viewer for recordings, and a replay's results as they come."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import polars as pl
+
+from ..recording import Recording
+from ..recording.atomic import AtomicFile
+from ..recording.errors import UsageError
+from . import viewer
+from .viewer import Viewer
+
+if TYPE_CHECKING:
+    from ..replay import Plan, ReplayResult
+    from .scene import Scene
+
+
+def show(
+    recs: Recording | Sequence[Recording],
+    web: bool = False,
+    wait: bool | None = None,
+    *,
+    open_browser: bool = True,
+    opened: Callable[[Viewer], object] | None = None,
+) -> Viewer:
+    """Open recordings in the viewer.
+
+    Parameters
+    ----------
+    recs : Recording or sequence of Recording
+        Several are shown together, each below its own name.
+    web : bool
+        In the browser, served to this machine only.
+    wait : bool, optional
+        Return only when the viewer has been closed (the web viewer: on Ctrl-C). By default a native viewer stays open
+        by itself, and the web viewer is waited for.
+    open_browser : bool
+        Whether to open a browser window by itself.
+    opened : callable, optional
+        Called with the viewer once it runs, for example to print its ``address``.
+
+    Returns
+    -------
+    Viewer
+        The process; ``close`` ends it.
+
+    Raises
+    ------
+    UsageError
+        No display on this machine.
+    MarchaError
+        The viewer did not start.
+    """
+    import rerun as rr
+
+    from .draw import draw, new_stream
+
+    recs = [recs] if isinstance(recs, Recording) else list(recs)
+    window = viewer.web(open_browser=open_browser) if web else viewer.native()
+    try:
+        if opened is not None:
+            opened(window)
+        stream = new_stream()
+        stream.set_sinks(rr.GrpcSink(viewer.uri(window.port)))
+        draw(recs, stream)
+        stream.flush()
+        stream.disconnect()
+        if wait if wait is not None else web:
+            with window:
+                window.wait()
+    except BaseException:
+        window.close()
+        raise
+    return window
+
+
+class LiveSink:
+    """A replay's sink that shows everything as it comes: in a file, a viewer, a browser, or all of them.
+
+    Parameters
+    ----------
+    path : path, optional
+        ``.rrd`` to write; there whole when the replay has ended well, or not at all.
+    show, web : bool
+        Viewers to open: native, browser. They stay open when the replay has ended.
+    overwrite : bool
+        Whether an earlier file may be replaced.
+    open_browser : bool
+        Whether the web viewer opens a browser window by itself.
+
+    Attributes
+    ----------
+    viewers : list of Viewer
+        The open viewers; ``wait`` or ``close`` them.
+    """
+
+    def __init__(
+        self,
+        path: Path | str | None = None,
+        *,
+        show: bool = False,
+        web: bool = False,
+        overwrite: bool = False,
+        open_browser: bool = True,
+    ) -> None:
+        if path is None and not show and not web:
+            raise UsageError("a live view needs a file, a viewer or the web viewer")
+        self._path = None if path is None else Path(path)
+        self._show, self._web, self._overwrite, self._browser = show, web, overwrite, open_browser
+        self._file: AtomicFile | None = None
+        self._scene: Scene | None = None
+        self.viewers: list[Viewer] = []
+
+    def open(self, plan: Plan) -> None:
+        """Open the file and the viewers."""
+        import rerun as rr
+
+        from .draw import new_stream
+
+        self._plan = plan
+        sinks: list[rr.FileSink | rr.GrpcSink] = []
+        try:
+            if self._path is not None:
+                self._file = AtomicFile(self._path, overwrite=self._overwrite)
+                sinks.append(rr.FileSink(self._file.part))
+            if self._show:
+                self.viewers.append(viewer.native())
+            if self._web:
+                self.viewers.append(viewer.web(open_browser=self._browser))
+            sinks += [rr.GrpcSink(viewer.uri(v.port)) for v in self.viewers]
+            self._stream = new_stream()
+            self._stream.set_sinks(*sinks)
+            self._stream.send_recording_name(Path(plan.source).stem)
+        except BaseException:
+            self._abort()
+            raise
+
+    def write(self, topic: str, table: pl.DataFrame) -> None:
+        """Show messages of one topic."""
+        if table.height:
+            self._begun(int(table["t_ns"][0])).write(topic, table)
+
+    def close(self, result: ReplayResult | None) -> None:
+        """Draw what needs the whole, and put the file in its place; ``result`` is None where the replay failed."""
+        import rerun as rr
+
+        from .blueprint import blueprint
+        from .draw import check_whole
+        from .report import replay_report
+
+        if result is None:
+            self._abort()
+            return
+        try:
+            scene = self._begun(0)
+            scene.end()
+            text = rr.TextDocument(replay_report(result), media_type=rr.MediaType.MARKDOWN)
+            scene.static(f"{scene.prefix}/report", text)
+            # the saved view opens at the whole track; open viewers keep what their user has arranged
+            self._stream.send_blueprint(blueprint([scene]), make_active=False)
+            self._stream.flush()
+            self._stream.disconnect()
+            if self._file is not None:
+                check_whole(self._file)
+        except BaseException:
+            self._abort()
+            raise
+        if self._file is not None:
+            self._file.commit()
+
+    def _abort(self) -> None:
+        if self._file is not None:
+            self._file.abort()
+        for window in self.viewers:
+            window.close()
+
+    def _begun(self, t_ns: int) -> Scene:
+        """Return the scene; its clock is known with the first message."""
+        from .blueprint import blueprint
+        from .draw import clock_from
+        from .scene import Scene
+
+        if self._scene is None:
+            self._scene = Scene(self._stream, self._plan.channels.values(), clock_from(t_ns))
+            self._scene.begin()
+            self._stream.send_blueprint(blueprint([self._scene], live=True))
+        return self._scene

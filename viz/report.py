@@ -1,0 +1,114 @@
+"""The report beside the pictures: metrics, parameters, findings and provenance as Markdown."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+
+from ..recording import Recording, open as open_recording
+from ..recording.errors import MarchaError
+from ..replay import ReplayResult, evaluate
+
+LONGEST = 120
+"""Characters of a cell; longer values (JSON, hashes) are cut, the recording has them whole."""
+
+LINEAGE = ("estimator", "version", "input", "samples", "loop_s")
+
+
+def report(rec: Recording) -> str:
+    """Return what a recording and its runs are, as Markdown.
+
+    Parameters
+    ----------
+    rec : Recording
+        Raw, or with estimates (their metrics are measured, see :func:`marcha.replay.evaluate`).
+    """
+    runs = {n.removeprefix("run/"): m for n, m in rec.metadata.items() if n.startswith("run/")}
+    parts = [f"# {rec.path.name}", "", f"{rec.duration_s:.2f} s, {len(rec.channels)} channels", ""]
+    if runs or any(t.startswith("/estimate/") for t in rec.channels):
+        parts += _metrics(rec)
+    if runs:
+        parts += _parameters(runs)
+        parts += _findings(
+            (f"run {run}", kind, count, detail)
+            for run, lineage in runs.items()
+            for kind, count, detail in json.loads(lineage.get("findings", "[]"))
+        )
+    parts += _findings(("reading", f.kind, f.count, f.detail) for f in rec.findings)
+    rows = [[t, c.schema, f"{c.count}"] for t, c in rec.channels.items()]
+    parts += ["## Channels", "", *_table(["topic", "message", "count"], rows)]
+    for name, record in rec.metadata.items():
+        if not name.startswith("run/"):
+            parts += [f"## {name}", "", *_table(["what", "value"], [[k, v] for k, v in record.items()])]
+    return "\n".join(parts)
+
+
+def replay_report(result: ReplayResult) -> str:
+    """Return what came of a replay, as Markdown: of its recording where one was written, else of its runs."""
+    if result.output is not None:
+        return report(open_recording(result.output))
+    names = list(dict.fromkeys(m for r in result.runs for m in r.metrics))
+    rows = [[m, *(_number(r.metrics.get(m)) for r in result.runs)] for m in names]
+    return "\n".join(
+        [
+            "# Replay",
+            "",
+            "## Metrics",
+            "",
+            *_table(["metric", *(r.run for r in result.runs)], rows),
+            *_parameters({r.run: r.lineage for r in result.runs}),
+            *_findings((f"run {r.run}", f.kind, f.count, f.detail) for r in result.runs for f in r.findings),
+        ]
+    )
+
+
+def _metrics(rec: Recording) -> list[str]:
+    try:
+        runs = evaluate(rec).runs
+    except MarchaError as error:
+        return ["## Metrics", "", f"Not measured: {error}", ""]
+    names = list(dict.fromkeys(m for r in runs for m in r.metrics))
+    rows = [[m, *(_number(r.metrics.get(m)) for r in runs)] for m in names]
+    parts = ["## Metrics", "", *_table(["metric", *(r.run for r in runs)], rows)]
+    for run in runs:
+        if run.alignment:
+            parts += [
+                f"{run.run}: {run.matched} samples compared with the reference, {run.dropped} without a partner, "
+                f"alignment {run.alignment}.",
+                "",
+            ]
+        if run.note:
+            parts += [f"{run.run}: {run.note}", ""]
+    return parts
+
+
+def _parameters(runs: Mapping[str, Mapping[str, str]]) -> list[str]:
+    given = {run: {k: v for k, v in m.items() if k in LINEAGE} for run, m in runs.items()}
+    for run, lineage in runs.items():
+        params = lineage.get("params", "")
+        values = json.loads(params) if params.startswith("{") else {}
+        values |= {k.removeprefix("param."): v for k, v in lineage.items() if k.startswith("param.")}
+        given[run] |= {k: str(v) for k, v in values.items()}
+    names = list(dict.fromkeys(k for values in given.values() for k in values))
+    rows = [[n, *(values.get(n, "") for values in given.values())] for n in names]
+    return ["## Runs and their parameters", "", *_table(["", *given], rows)]
+
+
+def _findings(rows: Iterable[tuple[str, str, int, str]]) -> list[str]:
+    found = [[where, kind, f"{count}", detail] for where, kind, count, detail in rows]
+    return ["## Findings", "", *_table(["where", "kind", "count", "detail"], found)] if found else []
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else "NaN" if math.isnan(value) else f"{value:.4g}"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    lines = [head, ["---"] * len(head), *rows]
+    return [*(f"| {' | '.join(_cell(c) for c in line)} |" for line in lines), ""]
+
+
+def _cell(text: str) -> str:
+    text = " ".join(str(text).split()).replace("|", "\\|")
+    return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"

@@ -1,0 +1,84 @@
+"""Saved views: a ``.rrd`` file with its blueprint."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import msgspec
+
+from ..recording.selection import Selection, selected_topics
+from ..recording import Recording
+from ..recording.atomic import AtomicFile
+
+
+def write_rrd(
+    recs: Recording | Sequence[Recording],
+    path: Path | str,
+    overwrite: bool = False,
+    *,
+    selection: Selection | None = None,
+) -> Path:
+    """Write what the viewer shows of one or several recordings, with its blueprint, into one file.
+
+    Parameters
+    ----------
+    recs : Recording or sequence of Recording
+        Several are shown together, each below its own name.
+    path : path
+        The ``.rrd``; there whole or not at all.
+    overwrite : bool
+        Whether an earlier file may be replaced.
+    selection : Selection, optional
+        Topics and range of time; everything by default.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    OutputExists
+        It exists and ``overwrite`` is false.
+    UsageError
+        A topic that a recording does not have.
+    MarchaError
+        A recording cannot be read, or the file not written.
+    """
+    recs = [recs] if isinstance(recs, Recording) else list(recs)
+    selection = selection or Selection()
+    topics = [selected_topics(rec, selection) for rec in recs]
+    file = AtomicFile(Path(path), overwrite=overwrite)
+    try:
+        import rerun as rr
+
+        from .draw import check_whole, draw, new_stream
+
+        stream = new_stream()
+        stream.set_sinks(rr.FileSink(file.part))
+        draw(recs, stream, topics=topics, start_ns=selection.start_ns, end_ns=selection.end_ns)
+        stream.flush()
+        stream.disconnect()
+        check_whole(file)
+    except BaseException:
+        file.abort()
+        raise
+    file.commit()
+    return Path(path)
+
+
+class RrdExporter:
+    """Rerun recording with its blueprint, for ``marcha export --to rrd``."""
+
+    name: ClassVar[str] = "rrd"
+    title: ClassVar[str] = "Rerun recording with its blueprint: opens in the Rerun viewer as marcha shows it"
+    suffix: ClassVar[str] = ".rrd"
+    Options: ClassVar[type[msgspec.Struct]] = Selection
+
+    def export(
+        self, rec: Recording, path: Path, options: Selection, *, overwrite: bool = False
+    ) -> list[Path]:
+        """Write the file; see :class:`marcha.export.Exporter`."""
+        return [write_rrd(rec, path, overwrite, selection=options)]
