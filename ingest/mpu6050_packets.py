@@ -129,7 +129,7 @@ def _sensors(paths: Sequence[Path]) -> dict[int, int]:
     """Return device id to sensor number (1 or 2), from the first block of each file."""
     ids: set[int] = set()
     for path in paths:
-        packets, _, _ = next(_packets(path))
+        packets, _ = next(_packets(path))
         ids |= {int(i) for i in np.unique(packets["id"])}
     if not ids:
         raise MarchaError(f"{paths[0]}: no 28-byte '$' packet in it; is it the device's binary log?")

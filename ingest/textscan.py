@@ -66,6 +66,42 @@ def _wall_clock(data, a, b):
 
 
 @numba.njit(cache=True, nogil=True)
+def _clean_row(data, pos, n, low, high, values, row):
+    """Read a row of the plainest form, or a blank line; return the next line's start, -1 where it is neither."""
+    columns = low.size
+    if n - pos < 20 * columns + 2:  # enough for every number that is read below: no more checks of the end
+        return np.int64(-1)
+    i = pos
+    if data[i] == 13 and data[i + 1] == 10:
+        return i + 2
+    if data[i] == 10:
+        return i + 1
+    for column in range(columns):
+        negative = data[i] == 45
+        if negative:
+            i += 1
+        start = i
+        value = np.int64(0)
+        digit = data[i] - np.uint8(48)
+        while digit < 10 and i - start < 17:
+            value = value * 10 + digit
+            i += 1
+            digit = data[i] - np.uint8(48)
+        if negative:
+            value = -value
+        if i == start or value < low[column] or value > high[column]:
+            return np.int64(-1)
+        values[column, row] = value
+        if column < columns - 1:
+            if data[i] != 44:
+                return np.int64(-1)
+            i += 1
+    if data[i] == 13 and data[i + 1] == 10:
+        return i + 2
+    return i + 1 if data[i] == 10 else np.int64(-1)
+
+
+@numba.njit(cache=True, nogil=True)
 def scan(data, low, high, first_line, values, lines, wall, odd):
     """Read all lines of ``data`` into ``values`` (columns, rows).
 
@@ -94,7 +130,15 @@ def scan(data, low, high, first_line, values, lines, wall, odd):
     line = first_line
     pos = 0
     while pos < n:
-        # The common case in one pass: sign, digits, separator, … up to the line's end.
+        i = _clean_row(data, pos, n, low, high, values, rows)
+        if i >= 0:
+            if i > pos + 2:
+                lines[rows] = line
+                wall[rows] = -1
+                rows += 1
+            line += 1
+            pos = i
+            continue
         a = pos
         end = pos
         while end < n and data[end] != 10 and data[end] != 13:
