@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from importlib import metadata
 from typing import Any
 
@@ -407,6 +408,7 @@ def _free(run: str, taken: set[str]) -> str:
     return name
 
 
+@lru_cache(maxsize=256)
 def _version(cls: type) -> str:
     """Return the distribution and version that a class comes from, its module where it is not installed."""
     package = cls.__module__.partition(".")[0]
