@@ -1,1 +1,7 @@
-"""To be written."""
+"""The command ``marcha``: parses, calls, prints; the work is done in the other rooms."""
+
+from __future__ import annotations
+
+from .app import main
+
+__all__ = ["main"]

@@ -11,7 +11,7 @@ import numpy as np
 from ..recording.errors import MarchaError, OutputExists
 from . import style
 from .scene import is_estimate
-from .track import Floats, Track, align
+from .track import Floats, Track, compare
 
 if TYPE_CHECKING:
     from ..recording import Recording
@@ -75,9 +75,9 @@ def _draw(rec: Recording, plan: Any, height: Any) -> None:
     everything = [*runs, *([reference] if reference else [])]
     frame = _frame(reference.shown if reference else np.concatenate([t.shown for t in runs]))
     for track in everything:
-        if reference is not None and track is not reference and (fit := align(track, reference)) is not None:
-            track.rotation, track.translation = fit.rotation, fit.translation
         shown = track.shown
+        if reference is not None and track is not reference and (fit := compare(track, reference, "se2")):
+            shown = fit.place.points(track.positions)
         inside = bool(((shown >= frame[0]) & (shown <= frame[1])).all())
         look: dict[str, Any] = {"color": track.color, "lw": 1.2, "label": track.owner}
         if track is reference:
@@ -86,7 +86,14 @@ def _draw(rec: Recording, plan: Any, height: Any) -> None:
             look["label"] += " (leaves the picture)"
         plan.plot(shown[:, 0], shown[:, 1], **look)
         height.plot((track.t_ns - zero) / 1e9, shown[:, 2], **look)
-    plan.set(xlim=frame[:, 0], ylim=frame[:, 1], xlabel="x (m)", ylabel="y (m)", title=rec.path.stem, aspect="equal")
+    plan.set(
+        xlim=frame[:, 0],
+        ylim=frame[:, 1],
+        xlabel="x (m)",
+        ylabel="y (m)",
+        title=rec.path.stem,
+        aspect="equal",
+    )
     height.set(ylim=frame[:, 2], xlabel="time (s)", ylabel="height (m)")
     height.legend(loc="center left", bbox_to_anchor=(1.01, 0.5), fontsize=8, frameon=False)
     for ax in (plan, height):

@@ -1,0 +1,122 @@
+"""The command line application: the list of commands, and what becomes of their results and failures.
+
+Nothing heavy is imported here or at the top of a command's module: ``marcha --help`` must answer at once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+from cyclopts import App, CycloptsError, Group, Parameter
+
+from .console import Outcome, complain, emit, emit_json
+from .errors import DONE, FAILED, INTERRUPTED, USAGE, expected
+
+EPILOGUE = (
+    "Exit codes: 0 done; 1 failed; 2 wrong usage; 3 done, but data was lost or\n"
+    "repaired in a way you should know; 4 a threshold was missed; 130 interrupted."
+)
+
+RAW = Group("From raw logs", sort_key=1)
+WORK = Group("Recordings", sort_key=2)
+HAND = Group("Look and hand on", sort_key=3)
+MORE = Group("More", sort_key=4)
+
+COMMANDS: tuple[tuple[Group, str, str, str], ...] = (
+    (RAW, "formats", "available:formats", "List the formats that can be read and written."),
+    (RAW, "simulate", "simulate:simulate", "Write raw logs of a simulated walk with known truth."),
+    (RAW, "convert", "convert:convert", "Turn raw logs into recordings and report every defect."),
+    (WORK, "info", "contents:info", "Show what a recording holds."),
+    (WORK, "check", "contents:check", "Look for what is wrong with a recording."),
+    (WORK, "estimators", "available:estimators", "List the estimators with their parameters."),
+    (WORK, "replay", "replay:replay", "Feed a recording to estimators as if it were live."),
+    (WORK, "evaluate", "replay:evaluate", "Measure the estimates of a replayed recording."),
+    (WORK, "study", "study:study", "Compare estimators over many recordings, with statistics."),
+    (HAND, "view", "view:view", "Show recordings on one time line in the Rerun viewer."),
+    (HAND, "annotate", "annotate:app", "Add, import or list labelled intervals of a recording."),
+    (HAND, "export", "export:export", "Write a recording, or part of it, in another tool's format."),
+    (HAND, "demo", "demo:demo", "Simulate, convert, replay, evaluate and export three walks."),
+    (MORE, "completion", "completion:completion", "Install completion for your shell, or print its script."),
+)
+"""Group, name, where it is, and the first line of its docstring: known without importing the command."""
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return version("marcha")
+
+
+def build(*, overview: bool = False) -> App:
+    """Return the application with every command registered.
+
+    ``overview`` takes the commands' summaries from :data:`COMMANDS`, so that listing them imports none.
+    """
+    app = App(
+        name="marcha",
+        help="From raw logs of walking to one recording, replayed and looked at.",
+        help_epilogue=EPILOGUE,
+        version=_version,
+        default_parameter=Parameter(negative="", show_default=False),
+        help_format="plaintext",
+        help_formatter="plain" if overview else "default",  # plain is there in half the time
+        result_action="return_value",
+        suppress_keyboard_interrupt=False,
+    )
+    app["--help"].group = app["--version"].group = MORE
+    for group, name, target, summary in COMMANDS:
+        app.command(f"{__package__}.{target}", name=name, help=summary if overview else None, group=group)
+    return app
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run ``marcha`` and return the exit code.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments without the program's name; those of the process by default.
+    """
+    tokens = list(sys.argv[1:] if argv is None else argv)
+    as_json = "--json" in tokens[: tokens.index("--")] if "--" in tokens else "--json" in tokens
+    try:
+        overview = not tokens or tokens[0].startswith("-")
+        result = build(overview=overview)(tokens, exit_on_error=False, print_error=False)
+        code = _finish(result, as_json=as_json)
+        sys.stdout.flush()
+        return code
+    except CycloptsError as error:
+        return _usage(error, as_json=as_json)
+    except BrokenPipeError:
+        # the reader of a pipe went away (`marcha info … | head`): nobody is left to tell
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILED
+    except (Exception, KeyboardInterrupt) as error:
+        known = expected(error)
+        if known is None:
+            raise
+        line, code = known
+        if as_json and code != INTERRUPTED:
+            emit_json({"error": line, "exit_code": code})
+        complain(line)
+        return code
+
+
+def _finish(result: Any, *, as_json: bool) -> int:
+    if isinstance(result, Outcome):
+        emit(result, as_json=as_json)
+        return result.code
+    return result if isinstance(result, int) else DONE
+
+
+def _usage(error: CycloptsError, *, as_json: bool) -> int:
+    words = " ".join(str(error).split())
+    command = " ".join(("marcha", *(error.command_chain or ())))
+    line = f"{words} See {command} --help."
+    if as_json:
+        emit_json({"error": line, "exit_code": USAGE})
+    complain(line)
+    return USAGE

@@ -1,0 +1,101 @@
+"""``marcha formats`` and ``marcha estimators``: what is installed, with parameters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from .console import Heading, Outcome, Table
+from .options import DEFAULT, Common
+
+
+def formats(*, common: Common = DEFAULT) -> Outcome:
+    """List the formats that can be read and written."""
+    import msgspec
+
+    from .. import export
+    from ..ingest.registry import formats as readable
+
+    readers = msgspec.to_builtins(readable())
+    writers = [
+        {"name": name, "title": kind.title, "options": _parameters(kind.Options)}
+        for name, kind in export.available().items()
+    ]
+    document = {"importers": readers, "exporters": writers}
+    lines: list[Heading | Table] = []
+    for title, entries in (
+        ("convert reads (options: --set)", readers),
+        ("export writes (options: --set)", writers),
+    ):
+        lines.append(Heading(f"{title}\n"))
+        for entry in entries:
+            lines += [
+                Heading(f"{entry['name']}: {entry['title']}"),
+                Table(
+                    ["  option", "default", "meaning"],
+                    [["  " + o["name"], str(o["default"] or ""), o["description"]] for o in entry["options"]],
+                ),
+                Heading(""),
+            ]
+    return Outcome(document, lines)
+
+
+def estimators(*, common: Common = DEFAULT) -> Outcome:
+    """List the estimators with their parameters."""
+    from .. import algorithms
+
+    entries = [
+        {
+            "name": name,
+            "title": kind.title,
+            "source": kind.source,
+            "offline": kind.offline,
+            "parameters": _parameters(kind.Params),
+            "presets": kind.presets,
+        }
+        for name, kind in algorithms.available().items()
+    ]
+    lines: list[Heading | Table] = []
+    for entry in entries:
+        offline = " (offline: needs the whole recording)" if entry["offline"] else ""
+        lines.append(Heading(f"{entry['name']}: {entry['title']}{offline}"))
+        if entry["source"]:
+            lines.append(Heading(f"  source: {entry['source']}"))
+        lines.append(
+            Table(
+                ["  parameter", ">default", "unit", "range", "meaning"],
+                [
+                    [
+                        "  " + p["name"],
+                        str(p["default"]),
+                        p["unit"],
+                        p["range"] or ", ".join(p["choices"]),
+                        p["description"],
+                    ]
+                    for p in entry["parameters"]
+                ],
+            )
+        )
+        for preset, values in entry["presets"].items():
+            chosen = ", ".join(f"{key}={value}" for key, value in values.items())
+            lines.append(Heading(f"  preset {preset}: {chosen}"))
+        lines.append(Heading(""))
+    return Outcome({"estimators": entries}, lines)
+
+
+def _parameters(struct: Any) -> list[dict[str, Any]]:
+    """Return what the fields of a struct say about themselves."""
+    from ..algorithms.parameters import describe
+
+    return [
+        {
+            "name": p.name,
+            "type": p.type,
+            "default": p.default,
+            "unit": p.unit,
+            "range": p.range,
+            "choices": list(p.choices),
+            "description": p.effect,
+            "source": p.source,
+        }
+        for p in describe(struct)
+    ]

@@ -1,0 +1,148 @@
+"""What the commands print: one JSON object or compact tables on stdout, progress on stderr."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from .options import Common, plain
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A line of text between tables."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under column titles (with units); numbers are aligned right.
+
+    Attributes
+    ----------
+    columns : sequence of str
+        Titles; one that starts with ``>`` is aligned right.
+    rows : sequence of sequences
+        Cells; None is shown as ``–``, a float with four significant digits.
+    """
+
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command has to say.
+
+    Attributes
+    ----------
+    document : dict
+        The object that ``--json`` prints.
+    lines : sequence of Heading or Table
+        The same for a person.
+    code : int
+        Exit code.
+    """
+
+    document: dict[str, Any]
+    lines: Sequence[Heading | Table] = field(default_factory=tuple)
+    code: int = 0
+
+
+def emit(outcome: Outcome, *, as_json: bool) -> None:
+    """Print an outcome on standard output."""
+    if as_json:
+        emit_json(outcome.document)
+        return
+    from rich.console import Console
+
+    out = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
+    for part in outcome.lines:
+        if isinstance(part, Heading):
+            out.print(part.text)
+        elif part.rows:
+            out.print(_grid(part, colour=out.is_terminal), crop=False, no_wrap=True)
+
+
+def emit_json(document: dict[str, Any]) -> None:
+    """Print one JSON object on standard output; what is not a number (NaN, infinity) becomes null."""
+    import msgspec
+
+    sys.stdout.write(msgspec.json.encode(document, enc_hook=plain).decode() + "\n")
+
+
+def complain(line: str) -> None:
+    """Write one line on standard error."""
+    sys.stderr.write(f"marcha: {line}\n")
+
+
+def number(value: Any) -> str:
+    """Return a cell's text: counts in full, measured values with four significant digits."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        if math.isnan(value):
+            return "–"
+        return f"{value:.0f}" if abs(value) >= 1e4 and math.isfinite(value) else f"{value:.4g}"
+    return str(value)
+
+
+def _grid(table: Table, *, colour: bool) -> Any:
+    from rich.table import Table as Grid
+    from rich.text import Text
+
+    grid = Grid(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold" if colour else "")
+    for title in table.columns:
+        right = title.startswith(">")
+        justify: Literal["right", "left"] = "right" if right else "left"
+        grid.add_column(Text(title.removeprefix(">")), justify=justify, no_wrap=True, overflow="ignore")
+    for row in table.rows:
+        grid.add_row(*(Text(number(cell)) for cell in row))
+    return grid
+
+
+def columns_of(runs: Iterable[tuple[str, dict[str, Any]]], title: str = "metric") -> Table:
+    """Return a table with one column a run and one row a figure, in the order of first appearance."""
+    runs = list(runs)
+    names = list(dict.fromkeys(name for _, figures in runs for name in figures))
+    return Table(
+        [title, *(f">{run}" for run, _ in runs)],
+        [[name, *(figures.get(name) for _, figures in runs)] for name in names],
+    )
+
+
+Progress = Callable[[float, float], None]
+"""Called with (done, total); a total of 0 is unknown."""
+
+
+@contextmanager
+def progress(what: str, common: Common, *, counted: bool = False) -> Iterator[Progress | None]:
+    """Give a callback that draws a bar on standard error; None where there is no terminal or it is not wanted.
+
+    ``counted`` shows how many instead of a share: for work of unknown length.
+    """
+    if common.quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
+
+    bars = Bars(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn() if counted else TextColumn("{task.percentage:>3.0f} %"),
+        *(() if counted else (TimeRemainingColumn(),)),
+        console=Console(stderr=True, highlight=False),
+        transient=True,
+    )
+    with bars:
+        task = bars.add_task(what, total=None)
+        yield lambda done, total: bars.update(task, completed=done, total=total or None)

@@ -1,0 +1,41 @@
+"""Which failures are expected, the one line that says them, and the exit code."""
+
+from __future__ import annotations
+
+import errno
+
+DONE, FAILED, USAGE, DEFECTS, THRESHOLD, INTERRUPTED = 0, 1, 2, 3, 4, 130
+
+
+def expected(error: BaseException) -> tuple[str, int] | None:
+    """Return the one line and the exit code of an expected failure, None where it is a bug.
+
+    Expected are :class:`MarchaError` (its own exit code), :class:`AlgorithmError` (the call is wrong: 2), an
+    ``OSError`` that names a path or says that the disk is full, and the keyboard.
+    """
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted; nothing was left half written", INTERRUPTED
+    if isinstance(error, OSError):
+        return _operating_system(error)
+    from ..algorithms.contract import AlgorithmError
+    from ..recording.errors import MarchaError
+
+    if isinstance(error, MarchaError):
+        return _one_line(error), error.exit_code
+    if isinstance(error, AlgorithmError):
+        return _one_line(error), USAGE
+    return None
+
+
+def _operating_system(error: OSError) -> tuple[str, int] | None:
+    reason = error.strerror or str(error)
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        where = f"{error.filename}: " if error.filename else ""
+        return f"{where}{reason}; free some space or write elsewhere; the output was not created", FAILED
+    if error.filename is None:
+        return None
+    return f"{error.filename}: {reason}", FAILED
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())

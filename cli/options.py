@@ -1,0 +1,132 @@
+"""Options that several commands share, and the values that are written in them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from cyclopts import Parameter
+
+if TYPE_CHECKING:
+    from ..recording import Recording
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class Common:
+    """What every command understands."""
+
+    json: Annotated[bool, Parameter(name="--json", negative="", group="Output")] = False
+    """Print one JSON object on standard output and nothing else there."""
+
+    quiet: Annotated[bool, Parameter(name=("--quiet", "-q"), negative="", group="Output")] = False
+    """No progress on standard error."""
+
+
+DEFAULT = Common()
+
+Force = Annotated[bool, Parameter(name="--force", negative="")]
+Output = Annotated[Path, Parameter(name=("--output", "-o"))]
+MaybeOutput = Annotated[Path | None, Parameter(name=("--output", "-o"))]
+Shown = Parameter(show_default=True)
+"""Marks a default that help should state; the others go without saying."""
+Strings = Annotated[tuple[str, ...], Parameter(negative="", consume_multiple=False)]
+
+_TIME = re.compile(
+    r"(?P<at>@)?(?P<value>[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?)(?P<unit>ns|us|ms|s|m|min|h)?", re.IGNORECASE
+)
+_UNIT_NS = {
+    "ns": 1,
+    "us": 1_000,
+    "ms": 1_000_000,
+    "s": 10**9,
+    "m": 60 * 10**9,
+    "min": 60 * 10**9,
+    "h": 3600 * 10**9,
+}
+
+
+def settings(pairs: tuple[str, ...], option: str) -> dict[str, str]:
+    """Return ``k=v`` pairs as a dict; the room that takes them gives the values their types.
+
+    Raises
+    ------
+    UsageError
+        A pair without ``=``, or the same key twice with different values.
+    """
+    from ..recording.errors import UsageError
+
+    found: dict[str, str] = {}
+    for pair in pairs:
+        key, sign, value = pair.partition("=")
+        key = key.strip()
+        if not sign or not key:
+            raise UsageError(
+                f"{option} {pair}: is not of the form key=value, for example {option} closed=true"
+            )
+        if found.setdefault(key, value.strip()) != value.strip():
+            raise UsageError(
+                f"{option} {key}: given twice, as {found[key]} and {value.strip()}; give it once"
+            )
+    return found
+
+
+def limits(pairs: tuple[str, ...], option: str) -> dict[str, float]:
+    """Return ``metric=number`` pairs as a dict of numbers; :func:`settings` states the errors."""
+    from ..recording.errors import UsageError
+
+    found: dict[str, float] = {}
+    for key, value in settings(pairs, option).items():
+        try:
+            found[key] = float(value)
+        except ValueError:
+            raise UsageError(f"{option} {key}={value}: {value!r} is not a number") from None
+    return found
+
+
+def instant(text: str | None, rec: Recording, option: str) -> int | None:
+    """Return a moment in the recording's own nanoseconds.
+
+    Parameters
+    ----------
+    text : str or None
+        ``12.5``, ``12.5s``, ``1m``, ``500ms``, ``250000ns``: that long after the start of the recording (a bare
+        number is seconds). ``@1700000000000000000``: that many nanoseconds (or another unit, ``@12.5s``) on the
+        recording's own clock. None stays None.
+    rec : Recording
+        Where the start is taken from.
+    option : str
+        Named in the error.
+
+    Raises
+    ------
+    UsageError
+        Anything else.
+    """
+    from decimal import Decimal
+
+    from ..recording.errors import UsageError
+
+    if text is None:
+        return None
+    match = _TIME.fullmatch(text.strip())
+    if match is None:
+        raise UsageError(
+            f"{option} {text}: is not a time; give 12.5s, 1m or 500ms after the start, or @NANOSECONDS of its clock"
+        )
+    unit = _UNIT_NS[(match["unit"] or ("ns" if match["at"] else "s")).lower()]
+    span = int((Decimal(match["value"]) * unit).to_integral_value())
+    return span if match["at"] else (rec.start_ns or 0) + span
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON knows it: NumPy scalars, paths and structs become numbers, text and dicts."""
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "item") and getattr(value, "ndim", None) == 0:
+        return value.item()
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise NotImplementedError(f"{type(value).__name__} has no JSON form")

@@ -1,0 +1,196 @@
+"""``marcha replay`` and ``marcha evaluate``: a recording through estimators, and how good the results are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from .console import Heading, Outcome, Table, columns_of, progress
+from .contents import finding_entry
+from .errors import DEFECTS, DONE, THRESHOLD
+from .options import DEFAULT, Common, Force, MaybeOutput, Shown, Strings, instant, limits, settings
+
+
+def replay(
+    path: Path,
+    /,
+    *,
+    estimator: Annotated[Strings, Parameter(name=("--estimator", "-e"))],
+    param: Annotated[Strings, Parameter(name=("--param", "-p"))] = (),
+    inputs: Annotated[Strings, Parameter(name="--input")] = (),
+    speed: Annotated[str, Shown] = "max",
+    start: Annotated[str | None, Parameter(name="--from")] = None,
+    end: Annotated[str | None, Parameter(name="--to")] = None,
+    output: MaybeOutput = None,
+    rrd: Path | None = None,
+    show: bool = False,
+    force: Force = False,
+    common: Common = DEFAULT,
+) -> Outcome:
+    """Feed a recording to estimators as if it were live.
+
+    Results are recorded beside the raw channels. Exit code 3 says that the
+    results of at least one run must not be used; its findings say why.
+
+    Parameters
+    ----------
+    path : Path
+        The recording.
+    estimator : str
+        Estimator to run: NAME, NAME[key=value,…] or LABEL=NAME[…]; may be repeated. All run in one pass.
+    param : str
+        key=value for every estimator that has this parameter; may be repeated.
+    inputs : str
+        Topic to attach to; may be repeated. Without it, every channel of the estimator's kind, one run each.
+    speed : str
+        max, or a factor of real time such as 1 or 2.5.
+    start : str
+        Start here: 12.5, 12.5s, 1m, 500ms after the recording's start, or @NANOSECONDS of its clock.
+    end : str
+        Stop before here; written like --from.
+    output : Path
+        Recording to write: everything that was in the input, and the estimates.
+    rrd : Path
+        Rerun file to write.
+    show : bool
+        Open the Rerun viewer and show the replay while it runs.
+    force : bool
+        Replace existing outputs.
+    """
+    from .. import recording
+    from .. import replay as rp
+
+    rec = recording.open(path)
+    sinks: list[Any] = []
+    if rrd is not None or show:
+        from .. import viz
+
+        sinks.append(viz.LiveSink(path=rrd, show=show, overwrite=force))
+    with progress("replay", common) as report:
+        result = rp.replay(
+            rec,
+            list(estimator),
+            params=settings(param, "--param"),
+            inputs=list(inputs) or None,
+            speed=speed,
+            start_ns=instant(start, rec, "--from"),
+            end_ns=instant(end, rec, "--to"),
+            out=output,
+            overwrite=force,
+            sinks=sinks,
+            progress=report,
+        )
+    runs = [
+        {
+            "run": run.run,
+            "estimator": run.estimator,
+            "input": run.input,
+            "params": run.params,
+            "samples": run.samples,
+            "fatal": run.fatal,
+            "loop_s": run.loop_s,
+            "outputs": list(run.outputs.values()),
+            "metrics": run.metrics,
+            "findings": [finding_entry(f) for f in run.findings],
+        }
+        for run in result.runs
+    ]
+    document = {
+        "output": str(output) if output else None,
+        "rrd": str(rrd) if rrd else None,
+        "runs": runs,
+    }
+    lines: list[Heading | Table] = [
+        Table(
+            ["run", "estimator", "input", ">samples", ">loop [s]"],
+            [[r["run"], r["estimator"], r["input"], r["samples"], r["loop_s"]] for r in runs],
+        ),
+        Heading(""),
+        columns_of((r["run"], r["metrics"]) for r in runs),
+        *(Heading(f"{r['run']}: {f['kind']}: {f['detail']}") for r in runs for f in r["findings"]),
+        *(Heading(f"wrote {p}") for p in (output, rrd) if p),
+    ]
+    return Outcome(document, lines, DEFECTS if any(r["fatal"] for r in runs) else DONE)
+
+
+def evaluate(
+    path: Path,
+    /,
+    *,
+    maximum: Annotated[Strings, Parameter(name="--max")] = (),
+    minimum: Annotated[Strings, Parameter(name="--min")] = (),
+    run: Annotated[Strings, Parameter(name="--run")] = (),
+    alignment: Annotated[Literal["none", "origin", "origin-yaw", "se2", "se3"], Shown] = "se3",
+    reference: str | None = None,
+    common: Common = DEFAULT,
+) -> Outcome:
+    """Measure the estimates of a replayed recording.
+
+    Parameters
+    ----------
+    path : Path
+        A recording with estimates (marcha replay … -o).
+    maximum : str
+        metric=limit that no run may exceed, for example rmse_deg=5; may be repeated. A miss gives exit code 4.
+    minimum : str
+        metric=limit that every run must reach; may be repeated.
+    run : str
+        Id of a run to measure; may be repeated. All without it.
+    alignment : str
+        How a track is laid on the reference: as it is, first position, also first heading, least squares over turn
+        about the vertical and shift, or over all rotations and shift.
+    reference : str
+        Topic of the reference track, where several would fit.
+    """
+    import msgspec
+
+    from .. import recording
+    from .. import replay as rp
+
+    bounds = limits(maximum, "--max"), limits(minimum, "--min")
+    evaluation = rp.evaluate(
+        recording.open(path), runs=list(run) or None, alignment=alignment, reference=reference
+    )
+    missed = rp.check_thresholds(evaluation, *bounds)
+    runs = msgspec.to_builtins(evaluation.runs)
+    figures = [
+        (
+            r["run"],
+            {
+                **r["metrics"],
+                "matched (samples)": r["matched"],
+                "dropped (samples)": r["dropped"],
+                "alignment": r["alignment"] or None,
+            },
+        )
+        for r in runs
+    ]
+    lines: list[Heading | Table] = [columns_of(figures)]
+    lines += [Heading(f"{r['run']}: {r['note']}") for r in runs if r["note"]]
+    for tier, label in dict.fromkeys((i["tier"], i["label"]) for r in runs for i in r["intervals"]):
+        lines += [Heading(f"\n{tier}: {label}"), columns_of(_within(runs, tier, label))]
+    lines += [Heading(_miss(m)) for m in missed]
+    return Outcome(
+        {"runs": runs, "missed": [msgspec.to_builtins(m) for m in missed]},
+        lines,
+        THRESHOLD if missed else DONE,
+    )
+
+
+def _within(runs: list[dict[str, Any]], tier: str, label: str) -> list[tuple[str, dict[str, Any]]]:
+    """Return one column a run and interval of this name; several of one name are numbered."""
+    found = []
+    for run in runs:
+        same = [i for i in run["intervals"] if (i["tier"], i["label"]) == (tier, label)]
+        for number, interval in enumerate(same, 1):
+            name = run["run"] if len(same) == 1 else f"{run['run']} ({number})"
+            found.append((name, interval["metrics"]))
+    return found
+
+
+def _miss(missed: Any) -> str:
+    sign = "above" if missed.kind == "max" else "below"
+    has = "has no value" if missed.value is None else f"{missed.value:.6g} is {sign} {missed.bound:g}"
+    return f"missed: {missed.run}: {missed.metric}: {has}"

@@ -1,0 +1,88 @@
+"""Which exporters there are, and the one call that runs one of them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from ..recording import Recording
+from ..recording.errors import UsageError
+from .contract import Exporter
+
+GROUP = "marcha.exporters"
+
+
+def available() -> dict[str, type[Exporter]]:
+    """Return the exporters that are installed, by name; a broken plug-in is a warning that names it."""
+    found: dict[str, type[Exporter]] = {}
+    for point in entry_points(group=GROUP):
+        try:
+            found[point.name] = point.load()
+        except Exception as error:  # a stranger's module may raise anything; it must not stop the others
+            reason = " ".join(str(error).split())
+            warnings.warn(
+                f"exporter {point.name} ({point.value}) cannot be loaded: {type(error).__name__}: {reason}",
+                stacklevel=2,
+            )
+    return dict(sorted(found.items()))
+
+
+def export(
+    rec: Recording,
+    to: str,
+    path: Path | str,
+    *,
+    options: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write a recording in another tool's format.
+
+    Parameters
+    ----------
+    rec : Recording
+        What to write.
+    to : str
+        Name of an exporter, for example ``csv``; :func:`available` lists them.
+    path : Path or str
+        File or folder to write.
+    options : mapping, optional
+        Options of the exporter by name; text is converted to the option's type.
+    overwrite : bool
+        Whether an earlier export at ``path`` may be replaced.
+
+    Returns
+    -------
+    list of Path
+        The files that were written.
+
+    Raises
+    ------
+    UsageError
+        Unknown exporter or option.
+    OutputExists
+        ``path`` exists and ``overwrite`` is false.
+    """
+    exporters = available()
+    if to not in exporters:
+        raise UsageError(f"export format {to!r}: not known; there are {', '.join(exporters)}")
+    chosen = exporters[to]
+    return chosen().export(rec, Path(path), _typed(chosen, options or {}), overwrite=overwrite)
+
+
+def _typed(exporter: type[Exporter], options: Mapping[str, Any]) -> msgspec.Struct:
+    fields = {field.name: field for field in msgspec.structs.fields(exporter.Options)}
+    values: dict[str, Any] = {}
+    for key, value in options.items():
+        if key not in fields:
+            known = ", ".join(fields) or "none"
+            raise UsageError(f"export option {key!r}: {exporter.name} does not have it; it has {known}")
+        values[key] = value
+    try:
+        return msgspec.convert(values, exporter.Options, strict=False)
+    except msgspec.ValidationError as error:
+        raise UsageError(f"export option of {exporter.name}: {error}") from None

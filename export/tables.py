@@ -1,0 +1,213 @@
+"""Folders of CSV or Parquet: one table a channel, with a sidecar that says what every column is."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import msgspec
+import polars as pl
+
+from ..recording import SCHEMAS, Channel, Recording
+from ..recording.selection import Selection, selected_topics, within
+from .events import COLUMNS as EVENT_COLUMNS
+from .events import to_events
+from .folder import MARKER, whole_folder
+
+EVENTS = "events.tsv"
+README = "README.txt"
+COMMON_COLUMNS = {
+    "t_ns": "ns, time that the row speaks of",
+    "t_log_ns": "ns, time when the row was known (equal for raw data)",
+}
+
+
+class TableExporter:
+    """What CSV and Parquet have in common; a subclass writes one stream of tables to one file."""
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    suffix: ClassVar[str] = ""
+    file_suffix: ClassVar[str]
+    Options: ClassVar[type[msgspec.Struct]] = Selection
+
+    @abstractmethod
+    def write(self, stream: pl.LazyFrame, file: Path, about: dict[str, str]) -> None:
+        """Write ``stream`` to ``file`` with bounded memory; ``about`` are facts for formats that can hold them."""
+
+    def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:
+        """Write a folder; see :class:`marcha.export.Exporter`."""
+        topics = selected_topics(rec, options)
+        with whole_folder(path, overwrite=overwrite) as folder:
+            names = _file_names(topics, self.file_suffix)
+            entries = []
+            for topic in topics:
+                channel = rec.channels[topic]
+                stream, rows = _stream(rec, channel, options)
+                about = {"topic": topic, "schema": channel.schema, "frame_id": channel.frame_id}
+                self.write(stream, folder / names[topic], about)
+                entries.append(_describe(channel, names[topic], rows()))
+            written = [names[topic] for topic in topics]
+            events = _events(rec, options)
+            if events.height:
+                events.write_csv(folder / EVENTS, separator="\t")
+                written.append(EVENTS)
+            attached = _attachments(rec, folder)
+            sidecar = {
+                "source": rec.path.name,
+                "start_ns": rec.start_ns,
+                "end_ns": rec.end_ns,
+                "selection": msgspec.to_builtins(options),
+                "channels": entries,
+                "metadata": rec.metadata,
+                "attachments": attached,
+            }
+            encoded = msgspec.json.format(msgspec.json.encode(sidecar), indent=2)
+            (folder / MARKER).write_bytes(encoded + b"\n")
+            (folder / README).write_text(
+                _readme(rec, entries, bool(events.height), attached), encoding="utf-8"
+            )
+            written += [*attached, MARKER, README]
+        return [path / name for name in written]
+
+
+class CsvExporter(TableExporter):
+    """Comma-separated text, UTF-8, a header line, numbers with every digit that they have."""
+
+    name = "csv"
+    title = "folder of CSV files, one a channel, with units in channels.json and events.tsv (spreadsheets, R, MATLAB)"
+    file_suffix = ".csv"
+
+    def write(self, stream: pl.LazyFrame, file: Path, about: dict[str, str]) -> None:
+        """Write one CSV file; lists and structs become JSON text in one cell."""
+        nested = [name for name, dtype in stream.collect_schema().items() if dtype.is_nested()]
+        stream.with_columns(pl.col(name).map_elements(_json_cell, pl.String) for name in nested).sink_csv(
+            file
+        )
+
+
+class ParquetExporter(TableExporter):
+    """Parquet, zstd, with topic, schema and frame in each file's own metadata."""
+
+    name = "parquet"
+    title = "folder of Parquet files, one a channel, with units in channels.json (Polars, pandas, DuckDB, R)"
+    file_suffix = ".parquet"
+
+    def write(self, stream: pl.LazyFrame, file: Path, about: dict[str, str]) -> None:
+        """Write one Parquet file."""
+        stream.sink_parquet(file, metadata=about)
+
+
+def _json_cell(value: Any) -> str:
+    plain = value.to_list() if isinstance(value, pl.Series) else value
+    return msgspec.json.encode(plain).decode()
+
+
+def _stream(rec: Recording, channel: Channel, options: Selection) -> tuple[pl.LazyFrame, Any]:
+    """Return a channel as a lazy stream of its windows, and a function that tells how many rows have passed."""
+    from polars.io.plugins import register_io_source
+
+    empty = rec.table(channel.topic, start_ns=0, end_ns=0, log_time=True)
+    passed = 0
+
+    def source(
+        with_columns: list[str] | None, predicate: pl.Expr | None, n_rows: int | None, batch_size: int | None
+    ) -> Iterator[pl.DataFrame]:
+        nonlocal passed
+        yield empty.select(with_columns or empty.columns)
+        for window in rec.windows([channel.topic], start_ns=options.start_ns, end_ns=options.end_ns):
+            table = window.tables.get(channel.topic)
+            if table is None or not table.height:
+                continue
+            passed += table.height
+            yield table.select(with_columns or empty.columns)
+
+    return register_io_source(source, schema=dict(empty.schema)), lambda: passed
+
+
+def _file_names(topics: list[str], suffix: str) -> dict[str, str]:
+    """Return a file name for each topic: its parts joined by ``_``, numbered where two would be the same."""
+    names: dict[str, str] = {}
+    taken: set[str] = set()
+    for topic in topics:
+        stem = "".join(c if c.isalnum() or c in "-_." else "_" for c in topic.strip("/")) or "channel"
+        name, number = stem, 1
+        while name.lower() in taken:
+            number += 1
+            name = f"{stem}_{number}"
+        taken.add(name.lower())
+        names[topic] = name + suffix
+    return names
+
+
+def _describe(channel: Channel, file: str, rows: int) -> dict[str, Any]:
+    """Return what the sidecar says about a channel and every column of its file."""
+    return {
+        "file": file,
+        "topic": channel.topic,
+        "schema": channel.schema,
+        "frame_id": channel.frame_id,
+        "rows": rows,
+        "columns": [{"name": name, **_meaning(channel.schema, name)} for name in _columns(channel)],
+        "metadata": dict(channel.metadata),
+    }
+
+
+def _columns(channel: Channel) -> list[str]:
+    return [*COMMON_COLUMNS, *(c for c in channel.columns if c not in COMMON_COLUMNS)]
+
+
+def _meaning(schema: str, column: str) -> dict[str, str]:
+    """Return unit and meaning of a column; in a schema whose columns carry names, the suffix decides."""
+    if column in COMMON_COLUMNS:
+        unit, _, doc = COMMON_COLUMNS[column].partition(", ")
+        return {"unit": unit, "meaning": doc}
+    known = SCHEMAS.get(schema)
+    if known is None:
+        return {"unit": "", "meaning": "as the schema of the recording says"}
+    if known.names:
+        fits = [c for c in known.columns if column.endswith(c.name)]
+        best = max(fits, key=lambda c: len(c.name), default=None)
+    else:
+        best = next((c for c in known.columns if c.name == column), None)
+    return {"unit": best.unit, "meaning": best.doc} if best else {"unit": "", "meaning": ""}
+
+
+def _events(rec: Recording, options: Selection) -> pl.DataFrame:
+    return to_events(within(rec.annotations, options), rec.start_ns or 0)
+
+
+def _attachments(rec: Recording, folder: Path) -> list[str]:
+    """Copy the attachments into ``attachments/``; return their names in the folder. None can leave it."""
+    written: list[str] = []
+    for attachment in rec.attachments:
+        parts = [p for p in attachment.name.replace("\\", "/").split("/") if p not in ("", ".", "..")]
+        name = "/".join(("attachments", *(parts or ["attachment"])))
+        file = folder / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(rec.attachment(attachment.name))
+        written.append(name)
+    return written
+
+
+def _readme(rec: Recording, entries: list[dict[str, Any]], events: bool, attached: list[str]) -> str:
+    """Return the page that a person reads first."""
+    lines = [
+        f"Export of {rec.path.name}",
+        "",
+        "One table a channel. t_ns is the time that a row speaks of, t_log_ns the time when it was known, both in",
+        "nanoseconds of the recording's clock. Vectors are in the frame that is named beside the channel; quaternions",
+        f"have their real part first. {MARKER} says the same for programs, with the recording's metadata.",
+    ]
+    for entry in entries:
+        frame = f", frame {entry['frame_id']}" if entry["frame_id"] else ""
+        lines += ["", f"{entry['file']}: {entry['topic']} ({entry['schema']}{frame}), {entry['rows']} rows"]
+        lines += [f"  {c['name']:<14} [{c['unit']}] {c['meaning']}".rstrip() for c in entry["columns"]]
+    if events:
+        lines += ["", f"{EVENTS}: annotations, tab separated, as BIDS events"]
+        lines += [f"  {name:<14} {meaning}" for name, meaning in EVENT_COLUMNS.items()]
+    if attached:
+        lines += ["", "attachments/: files that the recording carries", *(f"  {name}" for name in attached)]
+    return "\n".join(lines) + "\n"
