@@ -68,6 +68,9 @@ FLUID_PRESSURE = Input("sensor_msgs/msg/FluidPressure", ("pressure",), optional=
 SOURCE_RATE_HZ = 100.0
 """Sample rate of the source's device, for a bare ``make()``; a different measured rate is remarked."""
 
+RESTLESS = 0.03
+"""rad/s: above this spread of the rate the rest at the start is remarked."""
+
 _SKOG = "Skog et al. 2010, settings of the authors' program"
 _SOURCE = "dissertation, section 4.4"
 
@@ -175,11 +178,11 @@ class FootParams(DetectorParams, frozen=True, forbid_unknown_fields=True, kw_onl
     rest_acc: Annotated[
         float,
         meta("Rest at the start: greatest distance of f from its mean", "m/s²", "ours, measured", gt=0.0),
-    ] = 0.5
+    ] = 0.8
     rest_gyr: Annotated[
         float,
         meta("Rest at the start: greatest distance of ω from its mean", "rad/s", "ours, measured", gt=0.0),
-    ] = 0.1
+    ] = 0.3
     rest_bias_max: Annotated[
         float,
         meta(
@@ -375,6 +378,7 @@ class FootEstimator(KernelEstimator):
     has_sigma: ClassVar[bool] = True
     extra_inputs: ClassVar[tuple[Input, ...]] = ()
     presets: ClassVar[dict[str, dict[str, Any]]] = {
+        "short-rest": {"init_s": 0.3},
         "live": {"window_side": "trailing", "cleaning": "median"},
         "shoe-tuned": {"detector": "shoe", "shoe_max": 1e5},
         "are-tuned": {"detector": "are", "are_max": 0.3},
@@ -533,8 +537,18 @@ def _remarks(s: FloatArray, p: Any, rate_hz: float) -> list[Remark]:
         found.append(
             Remark(
                 "no_rest",
-                f"no rest of {p.init_s:g} s at the start; the first one begins at {start:.2f} s, and the estimate "
-                f"starts at its end",
+                f"no rest of {p.init_s:g} s at the start; the first one begins at {start:.2f} s, and the estimate starts "
+                f"at its end, after {100 * (s[INIT_INDEX] + 1) / taken:.0f} % of the rows; a shorter init_s may find one "
+                "earlier",
+            )
+        )
+    spread = math.sqrt(s[la.REST_SPREAD] / s[la.REST_COUNT])
+    if spread > RESTLESS:
+        found.append(
+            Remark(
+                "restless",
+                f"in the rest at {start:.2f} s the angular rate spreads by {spread:.3f} rad/s (a sensor that lies still: "
+                f"below {RESTLESS:g}): the bias taken from it is uncertain; hold still longer, or give a shorter init_s",
             )
         )
     ax, ay, az = s[la.INIT_MEAN : la.INIT_MEAN + 3]

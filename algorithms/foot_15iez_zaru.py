@@ -46,7 +46,7 @@ class Foot15IezZaruParams(base.Foot9IezParams, frozen=True, forbid_unknown_field
     ] = 3e-4
     sigma_acc_bias0: Annotated[
         float, meta("Standard deviation of the accelerometer bias after the rest", "m/s²", "measured", ge=0.0)
-    ] = 1e-3
+    ] = 3e-4
     sigma_gyr_walk: Annotated[
         float, meta("Random walk of the gyroscope bias, Q = σ²Δt", "rad/s/√s", "ours", ge=0.0)
     ] = 1e-6

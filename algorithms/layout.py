@@ -63,6 +63,7 @@ REST_COUNT = _take()
 REST_START = _take()
 REST_ELAPSED = _take()
 REST_MEAN = _take(6)  # acceleration, angular rate
+REST_SPREAD = _take()  # sum of ‖ω − running mean‖²
 REST_BEST = _take()  # longest rest seen, s
 INIT_INDEX = _take()  # sample that completed the rest, −1 not yet
 INIT_START = _take()

@@ -44,6 +44,7 @@ from .layout import (
     REST_ELAPSED,
     REST_GYR,
     REST_MEAN,
+    REST_SPREAD,
     REST_START,
     ROT,
     TIME,
@@ -83,6 +84,7 @@ def watch_rest(s: FloatArray, r: int, k: int) -> bool:
     if s[REST_COUNT] == 0.0:
         s[REST_START] = s[TIME]
         s[REST_ELAPSED] = 0.0
+        s[REST_SPREAD] = 0.0
         for i in range(6):
             s[REST_MEAN + i] = 0.0
         dt = 0.0
@@ -90,6 +92,8 @@ def watch_rest(s: FloatArray, r: int, k: int) -> bool:
     s[REST_ELAPSED] += dt
     for i in range(6):
         s[REST_MEAN + i] += (s[r + R_ACC + i] - s[REST_MEAN + i]) / s[REST_COUNT]
+    spread = _distance(s, r + R_GYR, REST_MEAN + 3)
+    s[REST_SPREAD] += spread * spread
     s[REST_BEST] = max(s[REST_BEST], s[REST_ELAPSED])
     # Half a nanosecond of grace: time steps are rounded differences.
     if s[REST_ELAPSED] + 5e-10 < s[INIT_S]:
