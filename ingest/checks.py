@@ -24,6 +24,33 @@ RATE_HIGH = 70.0
 STALE_ROWS = 4
 
 
+#: Medians that Earth allows, and what to ask where one lies outside: unit, low, high.
+PLAUSIBLE = {
+    "pressure_pa": ("Pa", 3e4, 1.2e5),
+    "mag": ("T", 5e-6, 1e-3),
+    "temperature_c": ("°C", -60.0, 90.0),
+}
+
+
+def check_plausible(
+    report: ReportBuilder, topic: str, columns: Mapping[str, FloatArray], lines: NDArray[np.int64]
+) -> None:
+    """Report ``unit_doubt`` where the median of a pressure, field or temperature is not of this Earth."""
+    values = {name: columns[name] for name in ("pressure_pa", "temperature_c") if name in columns}
+    if all(f"mag_{a}" in columns for a in "xyz"):
+        values["mag"] = np.sqrt(sum(columns[f"mag_{a}"] ** 2 for a in "xyz"))
+    for name, v in values.items():
+        unit, low, high = PLAUSIBLE[name]
+        finite = v[np.isfinite(v)]
+        if finite.size and not low <= (middle := float(np.median(finite))) <= high:
+            report.note(
+                "unit_doubt",
+                f"{topic} {name}: the median is {middle:.4g} {unit}, expected {low:g} … {high:g}: right unit?",
+                line=int(lines[0]),
+                subject=f"{topic} {name}",
+            )
+
+
 class SensorCheck:
     """Watches one accelerometer and gyroscope (either may be missing) while blocks stream by.
 

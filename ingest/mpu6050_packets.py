@@ -1,9 +1,9 @@
 r"""Binary packets of the shoe-mounted MPU-6050: 28 bytes a sensor, big-endian.
 
 ``'$' id:u8 t_ms:u32 q[4]:i16 a[3]:i16 g[3]:i16 '\r\n'``. ``q`` is the unit quaternion of the sensor's motion
-processor (DMP), w x y z in units of 2⁻¹⁴, rotation from the sensor frame to the DMP's level frame, whose heading is
-zero at power-up; ``a`` and ``g`` are counts of the 16-bit converter. The id is the sensor's number (1, 2, or
-counted from 0) or its bus address (0x68, 0x69).
+processor (DMP), w x y z in units of 2⁻¹⁴, rotation from the sensor frame to the DMP's level frame, whose
+heading is zero at power-up; ``a`` and ``g`` are counts of the 16-bit converter. The id is the sensor's number
+(1, 2, or counted from 0) or its bus address (0x68, 0x69).
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class Mpu6050Packets:
                 "time": "millis() of the controller, unrolled; zero at its boot",
                 "name": "MPU-6050, binary packets",
                 "mounting": options.mounting,
-                "frames": "imu1, imu2: axes as printed on the sensor, +1 g upwards at rest; orientation: from "
-                "the sensor to the DMP's level frame, z up, heading zero at power-up",
+                "frames": "imu1, imu2: axes as printed on the sensor, +1 g upwards at rest; orientation: "
+                "from the sensor to the DMP's level frame, z up, heading zero at power-up",
             }
         }
         channels = [
@@ -93,7 +93,7 @@ def _packet_starts(data: NDArray[np.uint8]) -> NDArray[np.int64]:
     found = np.flatnonzero((data[:last] == 36) & (data[26 : 26 + last] == 13) & (data[27 : 27 + last] == 10))
     if found.size < 2 or (np.diff(found) >= SIZE).all():
         return found
-    kept = []  # a '$' inside a packet whose 27th byte happens to be CR LF: the first one in the stream is real
+    kept = []  # a '$' inside a packet may have CR LF at its distance: the first in the stream is real
     free = 0
     for start in found.tolist():
         if start >= free:
@@ -149,7 +149,7 @@ def _blocks(
             for start, length in lost:
                 report.drop(
                     "lost_bytes",
-                    f"{path.name}: bytes that are no packet, first {length} from byte {start} on; read on behind",
+                    f"{path.name}: bytes that are no packet, the first {length} from byte {start} on",
                     count=length,
                     rows=-(-length // SIZE),
                     line=number + 1,
@@ -214,7 +214,7 @@ class _Sensor:
             first = int(np.argmax(wrong))
             self._report.loss(
                 "missing_cell",
-                f"{self.topic}: the quaternion's length is {norm[first]:.3g}, not 1: orientation left out (NaN)",
+                f"{self.topic}: the quaternion's length is {norm[first]:.3g}, not 1: left out (NaN)",
                 count=int(wrong.sum()),
                 line=int(lines[first]),
                 subject=f"{self.topic} quat",

@@ -98,7 +98,8 @@ def get(name: str) -> Registered:
     """
     known = importers()
     if name not in known:
-        raise UsageError(f"unknown format {name!r}; one of {', '.join(known)}")
+        broken = " (its plug-in cannot be used)" if name in entry_points(group=GROUP).names else ""
+        raise UsageError(f"unknown format {name!r}{broken}; one of {', '.join(known)}")
     return known[name]
 
 
@@ -202,7 +203,10 @@ def _resolve(path: Path, wanted: Registered | None, stack: contextlib.ExitStack)
     """Return (format, file or folder) of everything that one input holds."""
     if not path.exists():
         raise MarchaError(f"{path}: no such file or folder")
+    folders = wanted is not None and getattr(wanted.importer, "folders", False)
     whole = _candidates(path, wanted)
+    if not whole and wanted is not None and folders and path.is_dir():
+        return [(wanted.importer.name, path)]
     if whole:
         return [(whole[0].name, path)]
     if path.is_dir():
@@ -211,6 +215,8 @@ def _resolve(path: Path, wanted: Registered | None, stack: contextlib.ExitStack)
         folder = _unpack(path, stack)
         if inner := _candidates(folder, wanted):
             return [(inner[0].name, folder)]
+        if wanted is not None and folders:
+            return [(wanted.importer.name, folder)]
     else:
         if wanted is not None:
             return [(wanted.importer.name, path)]

@@ -128,7 +128,7 @@ def rows_of(
     odd = np.empty((room, 5), dtype=np.int64)
     rows, n_odd, passed = scan(data, low, high, first_line, values, lines, wall, odd)
     for number, start, end, status, column in odd[:n_odd].tolist():
-        text = _shown(piece[start:end])
+        text = shown(piece[start:end])
         if status == CHATTER:
             report.note("chatter", f"{text}: not a row of numbers; skipped", line=number)
         else:
@@ -137,7 +137,7 @@ def rows_of(
     return Rows(values[:, :rows], lines[:rows], wall[:rows]), passed
 
 
-def _shown(raw: bytes, width: int = 40) -> str:
+def shown(raw: bytes, width: int = 40) -> str:
     """A line of unknown bytes as short printable text in quotes."""
     text = raw[: width + 1].decode("ascii", "backslashreplace")
     text = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

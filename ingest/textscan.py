@@ -67,7 +67,7 @@ def _wall_clock(data, a, b):
 
 @numba.njit(cache=True, nogil=True)
 def _clean_row(data, pos, n, low, high, values, row):
-    """Read a row of the plainest form, or a blank line; return the next line's start, -1 where it is neither."""
+    """Read a row of the plainest form, or a blank line; return where the next begins, -1 if it is neither."""
     columns = low.size
     if n - pos < 20 * columns + 2:  # enough for every number that is read below: no more checks of the end
         return np.int64(-1)
