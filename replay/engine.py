@@ -263,13 +263,9 @@ class Engine:
             raise UsageError("the replay is finished; start a new one to seek")
         if not self.source.seekable:
             raise UsageError(f"{self.source.name}: a live source cannot seek")
-        best = max(
-            (c for c in self._checkpoints if c.log_ns <= t_ns),
-            key=lambda c: c.log_ns,
-            default=self._checkpoints[0],
-        )
-        if t_ns < self._position_ns or best.log_ns > self._position_ns:
-            self._restore(best)
+        if t_ns < self._position_ns:
+            before = [c for c in self._checkpoints if c.log_ns <= t_ns]
+            self._restore(before[-1] if before else self._checkpoints[0])
         self._run_free(t_ns, interruptible=False)
 
     def finish(self, complete: Callable[[list[Run]], None] | None = None) -> ReplayResult:

@@ -25,7 +25,7 @@ class IntervalEvaluation(msgspec.Struct):
     tier, label : str
         The annotation.
     start_ns, end_ns : int
-        Its times, half open.
+        Its times, both included.
     metrics : dict of str to float
         As overall, but those that need the whole walk.
     matched, dropped : int
@@ -236,7 +236,7 @@ def evaluate_run(view: RunView, intervals: pl.DataFrame | None = None) -> RunEva
         done.time_base = "estimate" if view.comparison.on_estimate else "reference"
         done.max_time_difference_s = view.comparison.matches.max_distance_s
     for row in intervals.iter_rows(named=True) if intervals is not None else ():
-        part = view.interval(row["start_ns"], row["end_ns"])
+        part = view.interval(row["start_ns"], row["end_ns"] + 1)  # annotations include their end
         done.intervals.append(
             IntervalEvaluation(
                 row["tier"], row["label"], row["start_ns"], row["end_ns"], _measure(part), *_matched(part)

@@ -222,7 +222,7 @@ class Runner:
     # -- annotations ---------------------------------------------------------------------------------
 
     def _note_stances(self, t_ns: IntArray, still: np.ndarray) -> None:
-        """Join still samples to intervals: first still sample to first moving one."""
+        """Join still samples to intervals: first to last still sample."""
         state = self._state
         before = state.still_since is not None
         edges = np.flatnonzero(np.diff(still.astype(np.int8), prepend=np.int8(before)))
@@ -230,7 +230,8 @@ class Runner:
             if state.still_since is None:
                 state.still_since = int(t_ns[edge])
             else:
-                self._stance.append((state.still_since, int(t_ns[edge])))
+                end = int(t_ns[edge - 1]) if edge else state.still_until
+                self._stance.append((state.still_since, end))
                 state.still_since = None
         state.still_until = int(t_ns[-1])
 
