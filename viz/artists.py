@@ -13,6 +13,9 @@ from . import style
 from .scene import ChannelLike, Floats, Scene, Threshold, Times, columns_of, is_estimate, thresholds_of
 from .track import Track
 
+FAR_ABOVE = 10.0
+"""A statistic that rises more than so many times above its threshold is shown up to there: else the threshold is at zero."""
+
 
 class Artist:
     """Draws one channel; subclasses say how."""
@@ -128,7 +131,9 @@ class Pose(Artist):
     def begin(self) -> None:
         # the channel named "pose" is its owner's track itself; others ("vicon") keep their name
         self.base = self.parent if self.what == "pose" else self.path
-        self.track = self.scene.tracks[self.base] = Track(self.owner, self.color)
+        self.track = Track(self.owner, self.color)
+        if self.scene.shows(self.owner):
+            self.scene.tracks[self.base] = self.track
         self.zero: Floats | None = None
         self.scene.lines(f"{self.base}/height", [self.owner], [self.color])
         self.scene.static(
@@ -169,7 +174,7 @@ class Pose(Artist):
             f"{self.base}/track",
             rr.LineStrips3D([line], colors=color, radii=rr.Radius.ui_points(1.0)),
         )
-        owners = list(self.scene.tracks)
+        owners = list(self.scene.tracks) if self.base in self.scene.tracks else [self.base]
         # names stand at different places of the walk, so that those of several runs do not cover each other
         at = len(line) * (owners.index(self.base) + 1) // (len(owners) + 1)
         first = owners[0] == self.base
@@ -194,8 +199,9 @@ class Stance(Artist):
             self.path,
             rr.StateConfiguration(
                 values=["still", "moving"],
-                labels=["still", ""],  # a swing is too short for a word
-                colors=[(*style.rgb(style.STILL), 255), (*style.rgb(style.MOVING), 80)],
+                labels=["still", "moving"],
+                colors=[(*style.rgb(style.STILL), 255), (*style.rgb(style.MOVING), 255)],
+                visible=[True, False],  # a swing is too short for a word: it is the gap between two stances
             ),
         )
         self.scene.show("stance", self.owner, "stance", self.path)
@@ -218,6 +224,7 @@ class Values(Artist):
 
     def begin(self) -> None:
         self.shown = {c: shown_as(c) for c in self.channel.columns}
+        self.highest = dict.fromkeys(self.shown, 0.0)
         role = "detector" if self.what == "detector" else "other"
         for name, shown in self.shown.items():
             path = f"{self.path}/{name}"
@@ -226,12 +233,18 @@ class Values(Artist):
 
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
         for name, shown in self.shown.items():
-            self.scalars(f"{self.path}/{name}", t_ns, columns_of(block, [name], [shown.factor])[:, 0])
+            values = columns_of(block, [name], [shown.factor])[:, 0]
+            self.scalars(f"{self.path}/{name}", t_ns, values)
+            finite = values[np.isfinite(values)]
+            self.highest[name] = max(self.highest[name], float(finite.max(initial=0.0)))
 
     def end(self) -> None:
         for limit in thresholds_of(self.channel):
             if limit.statistic in self.shown:
-                self.limit(f"{self.path}/{limit.statistic}", limit)
+                path = f"{self.path}/{limit.statistic}"
+                self.limit(path, limit)
+                if self.highest[limit.statistic] > FAR_ABOVE * limit.value > 0.0:
+                    self.scene.zoom[path] = (-0.1 * FAR_ABOVE * limit.value, FAR_ABOVE * limit.value)
 
 
 class Sigma(Artist):

@@ -12,12 +12,19 @@ import numpy as np
 import rerun.blueprint as rrb
 
 from .scene import TIMELINE, Entry, Floats, Scene
+from .track import Track
 
 TRAIL_S = 60.0
 """Length of the trail behind the cursor where a recording is too long to show all of it."""
 
 TRAIL_ROWS = 60_000
 """Up to this many samples the trail reaches back to the start."""
+
+RUN_AWAY = 3.0
+"""A track so many times larger than the smallest one has run away."""
+
+STANDING_M = 0.5
+"""A track smaller than this has not walked."""
 
 SPATIAL = ("track", "trail", "foot", "mark", "footprints")
 BACKGROUND = (24, 28, 34)
@@ -37,7 +44,7 @@ def blueprint(scenes: Sequence[Scene], *, live: bool = False) -> rrb.Blueprint:
     tabs = [
         _overview(scenes, entries),
         _raw(entries),
-        _detector(entries),
+        _detector(scenes, entries),
         _compare(scenes, entries),
         _report(entries),
     ]
@@ -63,12 +70,16 @@ def _below(entries: Iterable[Entry]) -> list[str]:
     return [f"{e.path}/**" for e in entries]
 
 
-def _plot(name: str, entries: Sequence[Entry], contents: Sequence[str] = ()) -> rrb.TimeSeriesView:
+def _plot(
+    name: str, entries: Sequence[Entry], *, alone: bool = False, span: tuple[float, float] | None = None
+) -> rrb.TimeSeriesView:
+    """Return a plot of entities and what lies below them (``alone``: without that), zoomed to ``span``."""
     return rrb.TimeSeriesView(
         origin="/",
-        contents=[*(contents or _below(entries))],
+        contents=[e.path for e in entries] if alone else _below(entries),
         name=name,
         axis_x=rrb.TimeAxis(link="LinkToGlobal"),
+        axis_y=rrb.ScalarAxis(range=span) if span is not None else None,
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
     )
 
@@ -122,38 +133,69 @@ def _space(
     )
 
 
+def _framed(scenes: Sequence[Scene]) -> tuple[list[Track], bool]:
+    """Return the tracks that a view should be zoomed to, and whether those are all.
+
+    One that has run away (an uncorrected mechanization falls through the floor) must not hide the others.
+    """
+    tracks = [t for s in scenes for t in s.tracks.values() if t.count]
+    walked = [t.size_m for t in tracks if t.size_m > STANDING_M]
+    framed = [t for t in tracks if t.size_m <= RUN_AWAY * min(walked)] if walked else tracks
+    return framed, len(framed) == len(tracks)
+
+
 def _extent(scenes: Sequence[Scene]) -> tuple[Floats, Floats]:
-    """Return the corners (3,), (3,) of all tracks as shown; a room of 10 m where nothing is known yet."""
-    shown = [p for s in scenes for p in s.extents()]
-    if not shown:
+    """Return the corners (3,), (3,) of the tracks as shown; a room of 10 m where nothing is known yet."""
+    tracks, _ = _framed(scenes)
+    if not tracks:
         return np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 1.0])
-    points = np.concatenate(shown)
+    points = np.concatenate([t.shown for t in tracks])
     return points.min(axis=0), points.max(axis=0)
 
 
+def _height(scenes: Sequence[Scene], entries: Sequence[Entry]) -> list[rrb.TimeSeriesView]:
+    found = _of(entries, "height")
+    if not found:
+        return []
+    tracks, everything = _framed(scenes)
+    span = None
+    if not everything:
+        z = np.concatenate([t.positions[:, 2] for t in tracks])
+        margin = 0.1 * (np.ptp(z) + STANDING_M)
+        span = (float(z.min() - margin), float(z.max() + margin))
+    return [_plot("height (m)", found, span=span)]
+
+
 def _overview(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Container | None:
-    plots: list[rrb.View] = []
-    if height := _of(entries, "height"):
-        plots.append(_plot("height (m)", height))
-    plots += _lanes(entries)
-    plots += [_plot(e.title, [e]) for e in _of(entries, "norm")[:2]]
+    lanes = _lanes(entries)
+    plots: list[rrb.View] = [*_height(scenes, entries), *lanes]
+    plots += [_plot(e.title, [e]) for e in _norms(scenes, entries)]
+    shares = [0.4 + 0.16 * len(_of(entries, "stance", "annotation")) if p in lanes else 1.0 for p in plots]
     if not _of(entries, "track", "map"):
-        return rrb.Vertical(*plots, name="Overview") if plots else None
+        return rrb.Vertical(*plots, row_shares=shares, name="Overview") if plots else None
     left: list[rrb.View] = []
     if _of(entries, "track"):
         left.append(_space(scenes, entries, "track"))
     if fixes := _of(entries, "map"):
         left.append(rrb.MapView(origin="/", contents=[e.path for e in fixes], name="map"))
     return rrb.Horizontal(
-        rrb.Vertical(*left), rrb.Vertical(*plots), column_shares=[3, 2], name="Overview"
+        rrb.Vertical(*left), rrb.Vertical(*plots, row_shares=shares), column_shares=[3, 2], name="Overview"
     )
+
+
+def _norms(scenes: Sequence[Scene], entries: Sequence[Entry]) -> list[Entry]:
+    """Return the norms of the sensor that the first run reads, or of the first sensor."""
+    norms = _of(entries, "norm")
+    runs = [run for s in scenes for run in s.runs]
+    used = [e for e in norms if any(e.owner.rsplit(" ")[-1][1:].replace("/", "_") in run for run in runs)]
+    return (used or norms)[:2]
 
 
 def _raw(entries: Sequence[Entry]) -> rrb.Container | None:
     raw = _of(entries, "raw")
     if not raw:
         return None
-    views = [_plot(e.title, [e], [e.path]) for e in raw]
+    views = [_plot(e.title, [e], alone=True) for e in raw]
     return rrb.Grid(*views, grid_columns=2 if len(views) > 3 else 1, name="Raw")
 
 
@@ -164,17 +206,20 @@ def _by_owner(entries: Iterable[Entry]) -> Iterator[tuple[str, list[Entry]]]:
     yield from groups.items()
 
 
-def _detector(entries: Sequence[Entry]) -> rrb.Container | None:
+def _detector(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Container | None:
     """Return, side by side, every run's statistics against their thresholds, above all stance lanes."""
     statistics = _of(entries, "detector")
     if not statistics:
         return None
+    zoom = {path: span for s in scenes for path, span in s.zoom.items()}
     runs = [
-        rrb.Vertical(*[_plot(e.title, [e]) for e in found], name=owner)
+        rrb.Vertical(*[_plot(e.title, [e], span=zoom.get(e.path)) for e in found], name=owner)
         for owner, found in _by_owner(statistics)
     ]
     top = rrb.Horizontal(*runs) if len(runs) <= 3 else rrb.Tabs(*runs)
-    return rrb.Vertical(top, *_lanes(entries), row_shares=[3, 1], name="Detector")
+    lanes = _lanes(entries)
+    shares = [3.0, *[0.4 + 0.16 * len(_of(entries, "stance", "annotation"))] * len(lanes)]
+    return rrb.Vertical(top, *lanes, row_shares=shares, name="Detector")
 
 
 def _compare(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Container | None:
@@ -183,7 +228,10 @@ def _compare(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Container
         return None
     plots: list[rrb.View | rrb.Container] = []
     if distance := _of(entries, "distance"):
-        plots.append(_plot("distance to the reference (m)", distance))
+        tracks, everything = _framed(scenes)
+        worst = max((t.worst_m for t in tracks), default=0.0)
+        span = None if everything or worst == 0.0 else (-0.1 * worst, 1.3 * worst)
+        plots.append(_plot("distance to the reference (m)", distance, span=span))
     errors = _of(entries, "error", "sigma")
     if errors:
         views = [
@@ -195,7 +243,8 @@ def _compare(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Container
         plots.append(_plot("speed (m/s)", speed))
     if steps := _of(entries, "step"):
         plots.append(_plot("step length (m)", steps))
-    plots += [_plot("height (m)", h) for h in [_of(entries, "height")] if h]
+    if not plots:
+        plots += _height(scenes, entries)
     return rrb.Horizontal(
         _space(scenes, entries, "from above", above=True),
         rrb.Vertical(*plots),

@@ -43,8 +43,8 @@ TIMELINE = "time"
 BLOCK_ROWS = 1000
 """Rows a block: small enough for bounded memory, large enough for speed (measured: 2.5 million rows/s)."""
 
-ALIGNMENT = "se2"
-"""A strapdown estimate knows the vertical but neither its first heading nor its place: only those are taken out."""
+ALIGNMENT = "origin-yaw"
+"""Tracks start together and in one direction, so that what is seen (and what sigma speaks of) is the drift since then."""
 
 FAR_M = 1e4
 """Positions farther from zero than this are logged relative to a local origin: Rerun's 3D is float32."""
@@ -176,11 +176,15 @@ class Scene:
         self.alignment = alignment
         self.entries: list[Entry] = []
         self.rows = 0
+        self.zoom: dict[str, tuple[float, float]] = {}  # entity -> range of the vertical axis
         self.tracks: dict[str, Track] = {}
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self._origin: Floats | None = None
         channels = list(channels)
+        # beside the reference itself, those of single sensors ("/reference/imu2/pose") would only cover it
+        main = any(c.topic == "/reference/pose" for c in channels)
+        self._aside = {self.owner(c.topic) for c in channels if main and is_second_reference(c.topic)}
         self.runs = list(dict.fromkeys(c.topic.split("/")[2] for c in channels if is_estimate(c.topic)))
         self.colors = {run: style.run_color(first_color + i) for i, run in enumerate(self.runs)}
         self.thresholds = sorted(
@@ -207,9 +211,14 @@ class Scene:
             name = " ".join(parts[1:-1]) if parts[1] == "reference" else topic
         return f"{self.prefix[1:]} {name}".strip()
 
+    def shows(self, owner: str) -> bool:
+        """Return whether views show what belongs to this owner."""
+        return owner not in self._aside
+
     def show(self, role: str, owner: str, title: str, path: str) -> None:
         """Say that a view should show an entity."""
-        self.entries.append(Entry(role, owner, title, path))
+        if self.shows(owner):
+            self.entries.append(Entry(role, owner, title, path))
 
     def origin(self, first: Floats) -> Floats:
         """Return the local origin for positions that begin at ``first`` (3,), in metres: zero unless far away."""
@@ -295,7 +304,7 @@ class Scene:
             found = compare(track, reference, self.alignment) if "/run/" in path else None
             if found is None:
                 continue
-            track.place = found.place
+            track.place, track.worst_m = found.place, float(np.linalg.norm(found.error, axis=1).max())
             self.static(
                 path, rr.Transform3D(translation=found.place.translation, mat3x3=found.place.rotation)
             )
@@ -308,10 +317,6 @@ class Scene:
             self.show("error", track.owner, f"error after alignment {self.alignment} (m)", error)
             self.show("distance", track.owner, "distance to the reference (m)", distance)
 
-    def extents(self) -> list[Floats]:
-        """Return the lowest and highest corner, (2, 3), of every track as shown, m."""
-        return [np.array([p.min(axis=0), p.max(axis=0)]) for t in self.tracks.values() if len(p := t.shown)]
-
     def span(self) -> Times:
         """Return first and last time seen, shape (2,), or nothing, shape (0,), before the first row."""
         if self.first_ns is None or self.last_ns is None:
@@ -322,6 +327,11 @@ class Scene:
 def is_estimate(topic: str) -> bool:
     """Return whether a topic is a run's output, ``/estimate/<run>/<what>``."""
     return topic.startswith("/estimate/") and topic.count("/") >= 3
+
+
+def is_second_reference(topic: str) -> bool:
+    """Return whether a topic is the truth of one sensor among several, ``/reference/<sensor>/<what>``."""
+    return topic.startswith("/reference/") and topic.count("/") > 2
 
 
 def thresholds_of(channel: ChannelLike) -> Iterator[Threshold]:

@@ -82,9 +82,10 @@ def screenshots(
             client.set_time(TIMELINE, timestamp=np.datetime64(cursor, "ns"), play_state="paused")
         else:
             client.set_time(TIMELINE, duration=np.timedelta64(cursor, "ns"), play_state="paused")
+        layout = client.get_blueprint(of="recording").blueprint
         pictures = []
         for tab in tabs:
-            _show_tab(client, tab, path, patience_s)
+            _show_tab(client, layout, tab, path, patience_s)
             time.sleep(SETTLE_S)
             png = client.take_screenshot()
             reports = tuple(
@@ -105,9 +106,8 @@ def _loaded(client: Any, path: Path, patience_s: float) -> Any:
     raise MarchaError(f"{path}: the viewer had not loaded it after {patience_s:g} s")
 
 
-def _show_tab(client: Any, name: str, path: Path, patience_s: float) -> None:
+def _show_tab(client: Any, layout: dict[str, Any], name: str, path: Path, patience_s: float) -> None:
     """Bring a tab of the outermost container to the front, and hide the viewer's own menu."""
-    layout = client.get_blueprint(of="recording").blueprint
     containers = {
         k.lstrip("/"): v["ContainerBlueprint"] for k, v in layout.items() if "ContainerBlueprint" in v
     }

@@ -27,11 +27,14 @@ class Track:
         Points taken and points kept so far.
     place : Transform
         How the positions are turned and moved before they are shown.
+    worst_m : float
+        Largest distance to the reference; 0 without one.
     """
 
     def __init__(self, owner: str, color: str) -> None:
         self.owner, self.color = owner, color
         self.place = Transform(np.eye(3), np.zeros(3))
+        self.worst_m = 0.0
         self._t: list[Times] = []
         self._p: list[Floats] = []
         self._stride, self.seen, self.count = 1, 0, 0
@@ -54,6 +57,12 @@ class Track:
     def shown(self) -> Floats:
         """Positions (n, 3) as they are shown, m."""
         return self.place.points(self.positions)
+
+    @property
+    def size_m(self) -> float:
+        """Diagonal of the box around all positions, m."""
+        p = self.positions
+        return float(np.linalg.norm(p.max(axis=0) - p.min(axis=0))) if len(p) else 0.0
 
     @property
     def last_ns(self) -> int:
@@ -86,7 +95,7 @@ class Compared:
     place : Transform
         From the track's coordinates to the reference's.
     t_ns : ndarray
-        Times (n,) of the track that have a partner.
+        Times (n,) of the track, or of a sparser reference, that have a partner.
     error : ndarray
         (n, 3), m: aligned track minus reference, in the track's own axes (those of its sigma).
     """
@@ -96,7 +105,7 @@ class Compared:
     error: Floats
 
 
-def compare(track: Track, reference: Track, alignment: str, max_gap_s: float = 1.0) -> Compared | None:
+def compare(track: Track, reference: Track, alignment: str, max_gap_s: float = 0.1) -> Compared | None:
     """Match a track with a reference in time, align it, and return its error.
 
     Parameters
@@ -106,19 +115,25 @@ def compare(track: Track, reference: Track, alignment: str, max_gap_s: float = 1
     alignment : str
         See :func:`marcha.replay.alignment.align`.
     max_gap_s : float
-        The reference is not interpolated over longer gaps.
+        Positions are not interpolated over longer gaps. Where the reference itself is sparser (footprints), it is
+        compared at its own times.
 
     Returns
     -------
     Compared or None
         None where fewer than two times have a partner.
     """
+    t_ns, once = np.unique(track.t_ns, return_index=True)
+    p = track.positions[once]
     t_ref, once = np.unique(reference.t_ns, return_index=True)
-    order = np.argsort(track.t_ns, kind="stable")
-    t_ns = track.t_ns[order]
-    found = match(t_ns, t_ref, max_gap_s)
-    if len(found.index) < 2:
+    q = reference.positions[once]
+    if len(t_ref) > 1 and float(np.median(np.diff(t_ref))) > max_gap_s * 1e9:  # surveyed points
+        found = match(t_ref, t_ns, max_gap_s)
+        t_ns, p, q = t_ref[found.index], found.linear(p) if len(found.index) else p[:0], q[found.index]
+    else:
+        found = match(t_ns, t_ref, max_gap_s)
+        t_ns, p, q = t_ns[found.index], p[found.index], found.linear(q) if len(found.index) else q[:0]
+    if len(t_ns) < 2:
         return None
-    p, q = track.positions[order][found.index], found.linear(reference.positions[once])
     place = align(p, q, alignment)
-    return Compared(place, t_ns[found.index], (place.points(p) - q) @ place.rotation)
+    return Compared(place, t_ns, (place.points(p) - q) @ place.rotation)
