@@ -1,0 +1,331 @@
+"""What the importers of headed inertial CSV share: units of the header, the stream from cells to channels."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+import polars as pl
+
+from ..recording.errors import MarchaError, UsageError
+from .checks import STANDARD_GRAVITY, SensorCheck
+from .clock import Clock
+from .contract import ChannelSpec, ReportBuilder
+
+IMU = "sensor_msgs/msg/Imu"
+MAG = "sensor_msgs/msg/MagneticField"
+ACC = ("acc_x", "acc_y", "acc_z")
+GYR = ("gyr_x", "gyr_y", "gyr_z")
+FIELD = ("mag_x", "mag_y", "mag_z")
+
+UNITS: dict[str, dict[str, float]] = {
+    "acc": {"g": STANDARD_GRAVITY, "m/s^2": 1.0, "m/s/s": 1.0, "m/s²": 1.0, "m/s2": 1.0},
+    "gyr": {"deg/s": math.pi / 180, "°/s": math.pi / 180, "dps": math.pi / 180, "rad/s": 1.0},
+    "mag": {"g": 1e-4, "gauss": 1e-4, "ut": 1e-6, "µt": 1e-6, "μt": 1e-6, "mt": 1e-3, "t": 1.0},
+    "t": {"s": 1e9, "ms": 1e6, "us": 1e3, "µs": 1e3, "μs": 1e3, "ns": 1.0},
+}
+"""Factor from a unit (lower case) to SI, time to nanoseconds."""
+
+FULL_SCALES = {
+    "acc": ("g", STANDARD_GRAVITY, (2.0, 4.0, 5.0, 8.0, 10.0, 16.0, 24.0, 32.0)),
+    "gyr": ("°/s", math.pi / 180, (125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0)),
+}
+"""Usual full scales of inertial sensors: unit, its SI value, the scales."""
+PLATEAU_ROWS = 3
+"""So many equal readings at the extreme are clipping, where it is near a full scale."""
+PLATEAU_TOLERANCE = 0.03
+"""How near: calibration moves the clipped value."""
+
+_QUANTITIES = {"accelerometer": "acc", "gyroscope": "gyr", "magnetometer": "mag"}
+_CELL = re.compile(r"(?P<what>[A-Za-z]+)(?: (?P<axis>[XYZ]))?(?: \((?P<unit>[^)]*)\))?")
+
+
+Mirror = Annotated[
+    Literal["x", "y", "none"],
+    msgspec.Meta(description="axis of the reference that is negated to make its frame right-handed, z up"),
+]
+MIRRORS = {"x": (-1.0, 1.0, 1.0), "y": (1.0, -1.0, 1.0), "none": (1.0, 1.0, 1.0)}
+"""Factors of a reference's x, y, z."""
+
+
+class Source(NamedTuple):
+    """Where a column comes from: the name in the header and the factor to SI."""
+
+    name: str
+    factor: float
+
+
+def x_io_columns(path: Path, names: Sequence[str], line: int) -> dict[str, Source]:
+    """Return the columns that x-io's headers name (``Gyroscope X (deg/s)``), and ``t`` of ``Time (s)``.
+
+    Raises
+    ------
+    MarchaError
+        A unit is unknown.
+    """
+    found: dict[str, Source] = {}
+    for name in names:
+        match = _CELL.fullmatch(name)
+        if match is None:
+            continue
+        what = match["what"].lower()
+        if what in ("time", "timestamp") and match["axis"] is None:
+            quantity, column = "t", "t"
+        elif what in _QUANTITIES and match["axis"]:
+            quantity = _QUANTITIES[what]
+            column = f"{quantity}_{match['axis'].lower()}"
+        else:
+            continue
+        found[column] = Source(name, factor(path, line, name, quantity, match["unit"] or ""))
+    return found
+
+
+def factor(path: Path, line: int, name: str, quantity: str, unit: str) -> float:
+    """Return the factor of a unit of ``acc``, ``gyr``, ``mag`` or ``t`` to SI (time: ns).
+
+    Raises
+    ------
+    MarchaError
+        The unit is unknown.
+    """
+    known = UNITS[quantity]
+    if unit.lower() not in known:
+        raise MarchaError(
+            f"{path}, line {line}: column {name!r}: unit {unit!r} is none of {', '.join(known)}; "
+            "import it with a mapping (--map)"
+        )
+    return known[unit.lower()]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Channels of a headed CSV: topic and schema, and the sources of the schema's columns."""
+
+    topic: str
+    schema: str
+    columns: Mapping[str, Source]
+    frame_id: str = "imu"
+    metadata: Mapping[str, str] | None = None
+    held: bool = False
+    """Whether the device repeats an older reading until a new one comes: repeats are no measurements."""
+
+    def spec(self) -> ChannelSpec:
+        """Return the channel as an import declares it."""
+        return ChannelSpec(self.topic, self.schema, self.frame_id, metadata=dict(self.metadata or {}))
+
+
+def complete(columns: Mapping[str, Source], axes: Sequence[str]) -> dict[str, Source]:
+    """Return the three axes of one sensor; empty where one is missing."""
+    return {a: columns[a] for a in axes} if all(a in columns for a in axes) else {}
+
+
+def note_unused(names: Sequence[str], used: Iterable[str], report: ReportBuilder, line: int) -> None:
+    """Report the header's columns that become nothing."""
+    taken = set(used)
+    left = [n for n in names if n not in taken]
+    if left:
+        report.note("unused_column", f"{', '.join(left)}: not imported", count=len(left), line=line)
+
+
+def note_mirror(mirror: Mirror, what: str, rows: int, report: ReportBuilder) -> None:
+    """Report that an axis of the reference ``what`` was negated."""
+    if mirror != "none":
+        report.note(
+            "mirrored_reference",
+            f"{what} is mirrored against a right-handed z-up frame: {mirror} is negated in every row; "
+            "mirror=none keeps it",
+            count=rows,
+            line=1,
+        )
+
+
+def one_file(paths: Sequence[Path], name: str) -> Path:
+    """Return the only path.
+
+    Raises
+    ------
+    UsageError
+        There are several, or it is a folder.
+    """
+    if len(paths) != 1:
+        raise UsageError(f"format {name} reads one file at a time, not {len(paths)}; convert them one by one")
+    if paths[0].is_dir():
+        raise UsageError(f"{paths[0]}: is a folder; format {name} reads one file")
+    return paths[0]
+
+
+def tables(
+    path: Path,
+    frames: Iterable[pl.DataFrame],
+    plans: Sequence[Plan],
+    clock: Clock,
+    report: ReportBuilder,
+    *,
+    limits: Mapping[str, tuple[float, float, str]] | None = None,
+) -> Iterator[tuple[str, pl.DataFrame]]:
+    """Turn frames of cells into the tables of all plans, with every check on the way.
+
+    Parameters
+    ----------
+    path : Path
+        The source, for messages.
+    frames : iterable of polars.DataFrame
+        ``t`` (Int64, ticks of ``clock``), ``line``, and the cells under the header's names (Float64).
+    plans : sequence of Plan
+        Channels to make; the Imu is the first.
+    clock : Clock
+        Repairs and stamps.
+    report : ReportBuilder
+        Takes what is found.
+    limits : mapping, optional
+        Full scales in SI units, see :class:`SensorCheck`.
+    """
+    imu = plans[0]
+    if not imu.columns:
+        raise MarchaError(
+            f"{path}: neither an accelerometer nor a gyroscope with its three axes in the header"
+        )
+    axes = [a for a in (*ACC, *GYR) if a in imu.columns]
+    check = SensorCheck(report, imu.topic, axes, limits=limits)
+    plateau = None if limits else Plateau(report, imu.topic, axes)
+    last: dict[str, pl.DataFrame] = {}
+    empty: pl.DataFrame | None = None
+    for frame, final in _with_end(frames):
+        if frame is None:
+            if empty is None:
+                break
+            frame = empty
+        empty = frame.clear()
+        frame = clock.feed(frame, final=final)
+        if not frame.height:
+            continue
+        lines = frame["line"].to_numpy()
+        _missing(frame, plans, report)
+        si = {a: frame[imu.columns[a].name].to_numpy() * imu.columns[a].factor for a in axes}
+        check.feed([si[a] for a in axes], lines)
+        check.feed_si([si[a] for a in ACC if a in si], [si[a] for a in GYR if a in si], lines)
+        if plateau is not None:
+            plateau.feed([si[a] for a in axes], lines)
+        for plan in plans:
+            table = frame.select(
+                "t_ns", *(pl.col(s.name).mul(s.factor).alias(c) for c, s in plan.columns.items())
+            )
+            if plan.held:
+                table = _fresh(table, last, plan, report, lines)
+            if table.height:
+                yield plan.topic, table
+    if not report.kept:
+        raise MarchaError(f"{path}: no row of numbers behind its header; nothing to convert")
+    check.finish()
+    if plateau is not None:
+        plateau.finish()
+
+
+def _with_end(frames: Iterable[pl.DataFrame]) -> Iterator[tuple[pl.DataFrame | None, bool]]:
+    for frame in frames:
+        yield frame, False
+    yield None, True
+
+
+def _missing(frame: pl.DataFrame, plans: Sequence[Plan], report: ReportBuilder) -> None:
+    for plan in plans:
+        for source in plan.columns.values():
+            gone = np.flatnonzero(np.isnan(frame[source.name].to_numpy()))
+            if gone.size:
+                report.loss(
+                    "missing_cell",
+                    f"{source.name}: no value; NaN in its place",
+                    count=gone.size,
+                    line=int(frame["line"][int(gone[0])]),
+                    subject=source.name,
+                )
+
+
+def _fresh(
+    table: pl.DataFrame, last: dict[str, pl.DataFrame], plan: Plan, report: ReportBuilder, lines: np.ndarray
+) -> pl.DataFrame:
+    """Return the rows whose reading differs from the one before."""
+    columns = list(plan.columns)
+    before = last.get(plan.topic)
+    values = table.select(columns).to_numpy()
+    first = values[:1] + 1 if before is None else before.select(columns).to_numpy()
+    same = (np.diff(values, axis=0, prepend=first) == 0).all(axis=1)
+    last[plan.topic] = table[-1:]
+    if same.any():
+        report.note(
+            "stale_repeat",
+            f"{plan.topic}: the reading is repeated until the sensor has a new one: only its first row is "
+            "a message",
+            count=int(same.sum()),
+            line=int(lines[np.argmax(same)]),
+            subject=plan.topic,
+        )
+    return table.filter(pl.Series(~same))
+
+
+class Plateau:
+    """Finds clipping where the full scale is not known: an axis stands at an extreme near a usual full scale.
+
+    Parameters
+    ----------
+    report : ReportBuilder
+        Where findings go.
+    subject : str
+        Name of the sensor.
+    axes : sequence of str
+        ``acc_x`` … ``gyr_z``, in the order that is fed.
+    """
+
+    def __init__(self, report: ReportBuilder, subject: str, axes: Sequence[str]) -> None:
+        self._report = report
+        self._subject = subject
+        self._axes = axes
+        self._ends: dict[tuple[str, int], tuple[float, int, int]] = {}  # extreme, how often, first line
+
+    def feed(self, values: Sequence[np.ndarray], lines: np.ndarray) -> None:
+        """Look at a block in SI units: one array an axis, and each row's line."""
+        for axis, v in zip(self._axes, values, strict=True):
+            for sign in (1, -1):
+                extreme = float(np.fmax.reduce(sign * v))
+                before, count, line = self._ends.get((axis, sign), (-np.inf, 0, 0))
+                if not extreme >= before:
+                    continue
+                at = np.flatnonzero(sign * v == extreme)
+                count, line = (count, line) if extreme == before else (0, int(lines[at[0]]))
+                self._ends[axis, sign] = (extreme, count + at.size, line)
+
+    def finish(self) -> None:
+        """Report ``clipped`` for every extreme that looks like a full scale."""
+        for (axis, sign), (extreme, count, line) in self._ends.items():
+            unit, one, scales = FULL_SCALES[axis[:3]]
+            near = [s for s in scales if abs(extreme / one - s) <= PLATEAU_TOLERANCE * s]
+            if count >= PLATEAU_ROWS and near:
+                value = f"{sign * extreme / one:.4g} {unit}"
+                self._report.loss(
+                    "clipped",
+                    f"{self._subject} {axis}: {count} readings stand at the extreme {value}, near a full "
+                    f"scale of {near[0]:g} {unit}: the true value is beyond it",
+                    count=count,
+                    line=line,
+                    subject=f"{self._subject} {axis} {sign}",
+                )
+
+
+def drop_untimed(frame: pl.DataFrame, name: str, report: ReportBuilder) -> pl.DataFrame:
+    """Return the rows whose time (cell ``name``) is a number; the others are bad rows."""
+    bad = frame[name].is_nan()
+    if bad.any():
+        report.drop(
+            "bad_row",
+            f"{name}: no time; row dropped",
+            count=int(bad.sum()),
+            line=int(frame["line"].filter(bad)[0]),
+        )
+        return frame.filter(~bad)
+    return frame
