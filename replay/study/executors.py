@@ -34,22 +34,11 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def execute(
-    function: Callable[[T], R],
-    tasks: Sequence[T],
-    *,
-    workers: int | None = None,
-    scheduler: str | None = None,
-) -> Iterator[Outcome[T, R]]:
-    """Run ``function`` on every task and yield (task, result or the exception it raised) as they finish.
+class Executor:
+    """Runs functions on many tasks; a context manager, since processes and connections must be closed.
 
     Parameters
     ----------
-    function : callable
-        Module-level function; function and tasks must be picklable.
-    tasks : sequence
-        The first one should be the cheapest: it runs here while the pool starts, and fills numba's caches on disk
-        once for all workers.
     workers : int, optional
         Processes; by default one a core. 1 runs everything in this process.
     scheduler : str, optional
@@ -60,14 +49,78 @@ def execute(
     UsageError
         For a scheduler that cannot be reached, without the ``cluster`` extra, or with ``workers`` as well.
     """
-    if workers is not None and workers < 1:
-        raise UsageError(f"workers={workers}: at least 1")
-    if scheduler is not None:
-        if workers is not None:
+
+    def __init__(self, workers: int | None = None, scheduler: str | None = None) -> None:
+        if workers is not None and workers < 1:
+            raise UsageError(f"workers={workers}: at least 1")
+        if scheduler is not None and workers is not None:
             raise UsageError("give either workers or a scheduler: a Dask cluster has workers of its own")
-        return _dask(function, tasks, scheduler)
-    count = min(cores() if workers is None else workers, len(tasks))
-    return _here(function, tasks) if count <= 1 else _pool(function, tasks, count)
+        self.processes = cores() if workers is None else workers
+        self._pool: ProcessPoolExecutor | None = None
+        self._client: Any = None
+        if scheduler is not None:
+            self._client = _connect(scheduler)
+            self.processes = max(1, len(self._client.nthreads()))
+
+    def __enter__(self) -> Executor:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+        if self._client is not None:
+            self._client.close()
+
+    def run(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outcome[T, R]]:
+        """Run ``function`` on every task and yield (task, result or the exception it raised) as they finish.
+
+        Parameters
+        ----------
+        function : callable
+            Module-level function; function and tasks must be picklable.
+        tasks : sequence
+            Where a pool has to be started, the first task runs here meanwhile, and fills numba's caches on disk
+            once for all workers: it should be a cheap one.
+        """
+        if self._client is not None:
+            return _on_cluster(self._client, function, tasks)
+        if self.processes == 1 or (len(tasks) < 2 and self._pool is None):
+            return ((task, _attempt(function, task)) for task in tasks)
+        return self._in_pool(function, tasks)
+
+    def _in_pool(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outcome[T, R]]:
+        waiting = list(reversed(tasks))
+        running: dict[Future[R], T] = {}
+        lost: list[T] = []
+        pool = self._pool
+        if pool is None:
+            pool = self._pool = _start(self.processes)
+            first = waiting.pop()
+            yield first, _attempt(function, first)
+        while waiting or running:
+            # Two tasks a worker: none waits for the parent, and a broken pool loses little.
+            while waiting and len(running) < 2 * self.processes and not lost:
+                try:
+                    running[pool.submit(function, waiting[-1])] = waiting[-1]
+                except BrokenProcessPool:
+                    lost.append(waiting[-1])
+                waiting.pop()
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                task = running.pop(future)
+                error = future.exception()
+                if isinstance(error, BrokenProcessPool):
+                    lost.append(task)
+                elif error is None:
+                    yield task, future.result()
+                elif isinstance(error, Exception):
+                    yield task, error
+                else:
+                    raise error
+            if lost and not running:
+                pool.shutdown()
+                yield from _one_by_one(function, lost)
+                lost = []
+                pool = self._pool = _start(self.processes)
 
 
 def _attempt(function: Callable[[T], R], task: T) -> R | Exception:
@@ -75,11 +128,6 @@ def _attempt(function: Callable[[T], R], task: T) -> R | Exception:
         return function(task)
     except Exception as error:  # one cell's failure must not end the study
         return error
-
-
-def _here(function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outcome[T, R]]:
-    for task in tasks:
-        yield task, _attempt(function, task)
 
 
 def _start_worker() -> None:
@@ -117,40 +165,6 @@ def _start(count: int) -> ProcessPoolExecutor:
     return pool
 
 
-def _pool(function: Callable[[T], R], tasks: Sequence[T], count: int) -> Iterator[Outcome[T, R]]:
-    lost: list[T] = []
-    pool = _start(count)
-    try:
-        yield tasks[0], _attempt(function, tasks[0])
-        waiting = list(reversed(tasks[1:]))
-        running: dict[Future[R], T] = {}
-        while waiting or running:
-            # Two tasks a worker: none waits for the parent, and a broken pool loses little.
-            while waiting and len(running) < 2 * count and not lost:
-                try:
-                    future = pool.submit(function, waiting[-1])
-                except BrokenProcessPool:
-                    lost.append(waiting.pop())
-                    break
-                running[future] = waiting.pop()
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                task = running.pop(future)
-                error = future.exception()
-                if isinstance(error, BrokenProcessPool):
-                    lost.append(task)
-                elif error is not None and not isinstance(error, Exception):
-                    raise error
-                else:
-                    yield task, error if error is not None else future.result()
-            if lost and not running:
-                pool.shutdown()
-                yield from _one_by_one(function, lost)
-                lost = []
-                pool = _start(count)
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
 def _one_by_one(function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outcome[T, R]]:
     """Find out which task kills its worker: each gets a process of its own."""
     for task in tasks:
@@ -167,7 +181,7 @@ def _one_by_one(function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outc
                 )
 
 
-def _dask(function: Callable[[T], R], tasks: Sequence[T], address: str) -> Iterator[Outcome[T, R]]:
+def _connect(address: str) -> Any:
     try:
         from dask import distributed  # pyright: ignore[reportMissingImports]
     except ImportError:
@@ -175,26 +189,24 @@ def _dask(function: Callable[[T], R], tasks: Sequence[T], address: str) -> Itera
             f"{address}: a Dask scheduler needs the extra `cluster`; pip install 'marcha[cluster]'"
         ) from None
     try:
-        client: Any = distributed.Client(address, timeout="10s", set_as_default=False)
+        return distributed.Client(address, timeout="10s", set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise UsageError(f"{address}: no Dask scheduler answers ({reason}); start `dask scheduler`") from None
-    return _dask_outcomes(distributed, client, function, tasks)
 
 
-def _dask_outcomes(
-    distributed: Any, client: Any, function: Callable[[T], R], tasks: Sequence[T]
-) -> Iterator[Outcome[T, R]]:
-    with client:
-        futures = {client.submit(_attempt, function, task, pure=False): task for task in tasks}
-        try:
-            for future in distributed.as_completed(futures):
-                task = futures.pop(future)
-                error = future.exception()
-                if error is None:
-                    yield task, future.result()
-                else:  # the cluster itself gave up on it: worker killed, function not importable there
-                    yield task, error if isinstance(error, Exception) else MarchaError(repr(error))
-                future.release()
-        finally:
-            client.cancel(list(futures))
+def _on_cluster(client: Any, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outcome[T, R]]:
+    from dask.distributed import as_completed  # pyright: ignore[reportMissingImports]
+
+    futures = {client.submit(_attempt, function, task, pure=False): task for task in tasks}
+    try:
+        for future in as_completed(list(futures)):
+            task = futures.pop(future)
+            error = future.exception()
+            if error is None:
+                yield task, future.result()
+            else:  # the cluster itself gave up on it: worker killed, function not importable there
+                yield task, error if isinstance(error, Exception) else MarchaError(repr(error))
+            future.release()
+    finally:
+        client.cancel(list(futures))

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import msgspec
 import numpy as np
 import polars as pl
 from matplotlib.axes import Axes
@@ -21,15 +21,18 @@ from matplotlib.patches import Patch
 from . import config as cfg
 from .analysis import order
 from .cells import Cell
-from .report import Picture
-from .store import write_atomic
+from .executors import Executor
+from .report import Material, Picture
 
 #: Okabe and Ito (2008): told apart with every kind of colour vision.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#F0E442")
 GREY = "#666666"
 
+#: Quartiles of fewer values say nothing: those groups are drawn as points.
+BOX_LEAST = 5
+
 #: matplotlib's settings for all figures; text stays text in SVG.
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "font.size": 10,
     "axes.titlesize": 11,
     "axes.spines.top": False,
@@ -59,24 +62,34 @@ def _samples(frame: pl.DataFrame, factor: str, levels: Sequence[str]) -> dict[st
 def _box(
     ax: Axes, samples: Samples, colours: Sequence[str], positions: Sequence[float], width: float
 ) -> None:
-    """Draw boxes (quartiles, whiskers to 1.5 interquartile ranges), means and, below 20, every value."""
-    parts = ax.boxplot(
-        list(samples.values()),
-        positions=list(positions),
-        widths=width,
-        patch_artist=True,
-        manage_ticks=False,
-        showmeans=True,
-        meanprops={"marker": "D", "markersize": 4, "markerfacecolor": "white", "markeredgecolor": "black"},
-        medianprops={"color": "black"},
-        flierprops={"marker": ".", "markersize": 4, "markerfacecolor": GREY, "markeredgecolor": GREY},
-    )
-    for box, face in zip(parts["boxes"], colours, strict=True):
-        box.set(facecolor=face, alpha=0.65)
-    for position, values in zip(positions, samples.values(), strict=True):
+    """Draw boxes (quartiles, whiskers to 1.5 interquartile ranges), means and, in groups below 20, every value."""
+    chosen = [k for k, values in enumerate(samples.values()) if len(values) >= BOX_LEAST]
+    everything = list(samples.values())
+    if chosen:
+        parts = ax.boxplot(
+            [everything[k] for k in chosen],
+            positions=[positions[k] for k in chosen],
+            widths=width,
+            patch_artist=True,
+            manage_ticks=False,
+            medianprops={"color": "black"},
+            flierprops={"marker": ".", "markersize": 4, "markerfacecolor": GREY, "markeredgecolor": GREY},
+        )
+        for box, k in zip(parts["boxes"], chosen, strict=True):
+            box.set(facecolor=colours[k], alpha=0.65)
+    for position, values, face in zip(positions, everything, colours, strict=True):
         if len(values) < 20:
-            spread = np.linspace(-0.15, 0.15, len(values)) * width if len(values) > 1 else np.zeros(1)
-            ax.plot(position + spread, values, ".", color="black", markersize=3, alpha=0.7)
+            spread = np.linspace(-0.2, 0.2, len(values)) * width if len(values) > 1 else np.zeros(1)
+            small = len(values) < BOX_LEAST
+            ax.plot(
+                position + spread,
+                values,
+                "o" if small else ".",
+                color=face if small else "black",
+                markersize=5 if small else 3,
+                alpha=0.8,
+            )
+        ax.plot(position, values.mean(), "D", markersize=4, markerfacecolor="white", markeredgecolor="black")
 
 
 def _axis_label(frame: pl.DataFrame) -> str:
@@ -92,9 +105,7 @@ def _scale(ax: Axes, frame: pl.DataFrame, log: bool) -> None:
         ax.set_ylim(bottom=0)
 
 
-def box_by(
-    frame: pl.DataFrame, config: cfg.StudyConfig, factor: str, *, log: bool = False, title: str = ""
-) -> Figure:
+def box_by(frame: pl.DataFrame, config: cfg.StudyConfig, factor: str, log: bool = False) -> Figure:
     """Box plot of one metric's values (rows of :func:`~marcha.replay.study.analysis.values`) by one factor."""
     levels = order(frame, config)[factor]
     samples = _samples(frame, factor, levels)
@@ -106,14 +117,12 @@ def box_by(
     labels = [f"{level}\nn = {len(v)}" for level, v in samples.items()]
     ax.set_xticks(range(len(samples)), labels, rotation=30 if long else 0, ha="right" if long else "center")
     ax.grid(axis="x", visible=False)
-    ax.set(xlabel=factor, ylabel=_axis_label(frame), title=title or f"{frame['metric'][0]} by {factor}")
+    ax.set(xlabel=factor, ylabel=_axis_label(frame), title=f"{frame['metric'][0]} by {factor}")
     _scale(ax, frame, log)
     return figure
 
 
-def box_by_both(
-    frame: pl.DataFrame, config: cfg.StudyConfig, *, log: bool = False, title: str = ""
-) -> Figure:
+def box_by_both(frame: pl.DataFrame, config: cfg.StudyConfig, log: bool = False) -> Figure:
     """Box plot of one metric by configuration, and by filter within each."""
     levels = order(frame, config)
     filters, configurations = levels["filter"], levels["configuration"]
@@ -131,7 +140,7 @@ def box_by_both(
         ax.axvline(i - 0.5, color="#c8c8c8", linewidth=0.8)
     ax.grid(axis="x", visible=False)
     ax.set(xlabel="configuration", ylabel=_axis_label(frame))
-    ax.set_title(title or f"{frame['metric'][0]} by configuration and filter")
+    ax.set_title(f"{frame['metric'][0]} by configuration and filter")
     handles = [Patch(facecolor=colour(k), alpha=0.65, label=name) for k, name in enumerate(filters)]
     mean = Line2D(
         [], [], marker="D", linestyle="", markersize=4, markerfacecolor="white", color="black", label="mean"
@@ -143,7 +152,7 @@ def box_by_both(
     return figure
 
 
-def qq(frame: pl.DataFrame, config: cfg.StudyConfig, *, title: str = "") -> Figure | None:
+def qq(frame: pl.DataFrame, config: cfg.StudyConfig) -> Figure | None:
     """Normal Q-Q plots of one metric, a panel a configuration × filter; None where every group is too small."""
     from scipy import stats
 
@@ -174,18 +183,19 @@ def qq(frame: pl.DataFrame, config: cfg.StudyConfig, *, title: str = "") -> Figu
                 ax.text(0.5, 0.5, "too few values", transform=ax.transAxes, ha="center", color=GREY)
                 ax.set(xticks=[], yticks=[])
                 continue
-            (quantiles, ordered), (slope, intercept, _) = stats.probplot(values)
+            fit: Any = stats.probplot(values)
+            (quantiles, ordered), (slope, intercept, _) = fit
             ax.plot(quantiles, ordered, ".", color=colour(filters.index(name)), markersize=5)
             ends = np.array([quantiles[0], quantiles[-1]])
             ax.plot(ends, intercept + slope * ends, color="black", linewidth=0.9)
             ax.tick_params(labelsize=8)
     figure.supxlabel("quantiles of the standard normal distribution")
     figure.supylabel(_axis_label(frame) + ", by configuration")
-    figure.suptitle(title or f"Q-Q plots of {frame['metric'][0]}")
+    figure.suptitle(f"Q-Q plots of {frame['metric'][0]}")
     return figure
 
 
-def tracks(cells: Sequence[Cell], config: cfg.StudyConfig, *, title: str = "") -> Figure | None:
+def tracks(cells: Sequence[Cell], config: cfg.StudyConfig) -> Figure | None:
     """Overlaid tracks seen from above, a panel a configuration × filter."""
     drawn = [c for c in cells if c.status == "ok" and len(c.positions) > 1]
     if not drawn:
@@ -194,46 +204,49 @@ def tracks(cells: Sequence[Cell], config: cfg.StudyConfig, *, title: str = "") -
         f for f in dict.fromkeys(m.label for m in cfg.methods(config)) if any(c.label == f for c in drawn)
     ]
     configurations = sorted({c.configuration for c in drawn})
-    figure = Figure(figsize=(0.8 + 2.5 * len(filters), 0.9 + 2.4 * len(configurations)))
-    axes = figure.subplots(len(configurations), len(filters), squeeze=False, sharex=True, sharey=True)
+    # One filter on many configurations goes across the page, not down.
+    across = len(filters) < 3 < len(configurations)
+    rows, columns = (filters, configurations) if across else (configurations, filters)
+    figure = Figure(figsize=(0.8 + 2.4 * len(columns), 0.9 + 2.4 * len(rows)))
+    axes = figure.subplots(len(rows), len(columns), squeeze=False, sharex=True, sharey=True)
     ends = np.concatenate([c.positions[:, :2] for c in drawn])
     # A diverged track must not shrink all the others to a dot.
     low, high = np.nanpercentile(ends, 1, axis=0), np.nanpercentile(ends, 99, axis=0)
     reach = 0.62 * max(float((high - low).max()), 0.5)
     middle = (low + high) / 2
-    for i, configuration in enumerate(configurations):
-        for k, name in enumerate(filters):
-            ax = axes[i, k]
+    for i, row in enumerate(rows):
+        for k, column in enumerate(columns):
+            name, configuration = (row, column) if across else (column, row)
             own = [c for c in drawn if c.configuration == configuration and c.label == name]
-            alpha = min(1.0, max(0.15, 4 / max(1, len(own))))
-            outside = 0
-            for cell in own:
-                x, y, _ = cell.positions.T
-                ax.plot(
-                    x, y, color=colour(k), linewidth=0.9, alpha=alpha, linestyle="--" if cell.clipped else "-"
-                )
-                ax.plot(x[-1], y[-1], "o", color="black", markersize=2.5, alpha=max(alpha, 0.4))
-                outside += bool((np.abs(cell.positions[:, :2] - middle) > reach).any())
-            ax.plot(0, 0, "+", color="black", markersize=8)
-            ax.set_aspect("equal", adjustable="box")
-            note = f"n = {len(own)}" + (f", {outside} leave the frame" if outside else "")
-            ax.text(0.02, 0.98, note, transform=ax.transAxes, va="top", fontsize=8, color=GREY)
+            ax = axes[i, k]
+            _overlay(ax, own, colour(filters.index(name)), middle, reach)
             if i == 0:
-                ax.set_title(name)
+                ax.set_title(column)
             if k == 0:
-                ax.set_ylabel(f"{configuration}\ny (m)")
-            if i == len(configurations) - 1:
+                ax.set_ylabel(f"{row}\ny (m)")
+            if i == len(rows) - 1:
                 ax.set_xlabel("x (m)")
     axes[0, 0].set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[1] - reach, middle[1] + reach))
-    figure.suptitle(
-        title
-        or "Tracks from above; + start, dots ends"
-        + (", dashed: clipped input" if any(c.clipped for c in drawn) else "")
-    )
+    figure.suptitle("Tracks from above")
     return figure
 
 
-def consistency(table: pl.DataFrame, *, title: str = "") -> Figure:
+def _overlay(ax: Axes, cells: Sequence[Cell], face: str, middle: np.ndarray, reach: float) -> None:
+    """Draw one panel of tracks."""
+    alpha = min(1.0, max(0.15, 4 / max(1, len(cells))))
+    outside = 0
+    for cell in cells:
+        x, y, _ = cell.positions.T
+        ax.plot(x, y, color=face, linewidth=0.9, alpha=alpha, linestyle="--" if cell.clipped else "-")
+        ax.plot(x[-1], y[-1], "o", color="black", markersize=2.5, alpha=max(alpha, 0.4))
+        outside += bool((np.abs(cell.positions[:, :2] - middle) > reach).any())
+    ax.plot(0, 0, "+", color="black", markersize=8)
+    ax.set_aspect("equal", adjustable="box")
+    note = f"n = {len(cells)}" + (f", {outside} leave the frame" if outside else "")
+    ax.text(0.02, 0.98, note, transform=ax.transAxes, va="top", fontsize=8, color=GREY)
+
+
+def consistency(table: pl.DataFrame) -> Figure:
     """Mean normalized error squared of every filter with the interval that a consistent filter lies in.
 
     ``table`` has ``metric, filter, mean, low, high`` (see :func:`~marcha.replay.study.analysis.consistency`).
@@ -254,76 +267,99 @@ def consistency(table: pl.DataFrame, *, title: str = "") -> Figure:
         ax.set_yscale("log")
         ax.set(title=metric, ylabel="mean NEES (1)")
         ax.legend(fontsize=8)
-    figure.suptitle(title or "Consistency of the filters' covariance (above the band: too sure of itself)")
+    figure.suptitle("Consistency of the filters' covariance")
     return figure
 
 
-def _figures(
-    frame: pl.DataFrame, cells: Sequence[Cell], nees: pl.DataFrame, config: cfg.StudyConfig
-) -> Iterator[tuple[str, str, str, Figure | None]]:
-    """Yield (name, section, caption, figure) of everything that the study has to show."""
+class Drawing(msgspec.Struct, frozen=True):
+    """A figure to be drawn, in any process.
+
+    Attributes
+    ----------
+    name, section, caption : str
+        See :class:`~marcha.replay.study.report.Picture`.
+    function : callable
+        One of this module's, which returns a figure or None.
+    arguments : tuple
+        Its arguments.
+    """
+
+    name: str
+    section: str
+    caption: str
+    function: Callable[..., Figure | None]
+    arguments: tuple[Any, ...]
+
+
+def drawings(material: Material, cells: Sequence[Cell], config: cfg.StudyConfig) -> list[Drawing]:
+    """Return all that the study has to show, in the order of the report."""
+    frame, nees = material.values, material.consistency
     levels = order(frame, config)
     first = levels["detector"][0] if levels["detector"] else ""
-    with_detector = f", detector {first}" if first else ""
-    shown = frame.filter(pl.col("detector") == first)
+    detector = f", detector {first}" if first else ""
+    found: list[Drawing] = []
     for metric in config.metrics:
         title = cfg.metric_title(metric)
-        part = shown.filter((pl.col("metric") == title) & pl.col("value").is_finite())
+        whole = frame.filter((pl.col("metric") == title) & pl.col("value").is_finite())
+        part = whole.filter(pl.col("detector") == first)
         if not len(part):
             continue
         stem = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
         section = "run time" if metric.column == "run_time_s" else "box"
         for factor in ("filter", "configuration"):
             if len(levels[factor]) > 1:
-                caption = f"{title} by {factor}, all other factors together{with_detector}."
-                yield f"box-{stem}-{factor}", section, caption, box_by(part, config, factor, log=metric.log)
-        caption = f"{title} by configuration and filter{with_detector}."
-        yield f"box-{stem}-both", section, caption, box_by_both(part, config, log=metric.log)
-        if len(levels["detector"]) > 1 and section == "box":
-            whole = frame.filter((pl.col("metric") == title) & pl.col("value").is_finite())
+                caption = f"{title} by {factor}, all other factors together{detector}."
+                arguments = (part, config, factor, metric.log)
+                found.append(Drawing(f"box-{stem}-{factor}", section, caption, box_by, arguments))
+        if len(levels["filter"]) > 1 and len(levels["configuration"]) > 1:
+            caption = f"{title} by configuration and filter{detector}."
+            arguments = (part, config, metric.log)
+            found.append(Drawing(f"box-{stem}-both", section, caption, box_by_both, arguments))
+        if section == "run time":
+            continue
+        if len(levels["detector"]) > 1:
             caption = f"{title} by detector, all filters and configurations together."
-            yield f"box-{stem}-detector", section, caption, box_by(whole, config, "detector", log=metric.log)
-        if section == "box":
-            caption = f"{title}: ordered values against normal quantiles; on the line they are normal{with_detector}."
-            yield f"qq-{stem}", "qq", caption, qq(part, config)
-    if config.tracks:
-        own = [c for c in cells if c.detector == first]
-        caption = (
-            f"Tracks seen from above, start at the cross{with_detector}. Headings at the start are all zero."
-        )
-        yield "tracks", "tracks", caption, tracks(own, config)
+            arguments = (whole, config, "detector", metric.log)
+            found.append(Drawing(f"box-{stem}-detector", section, caption, box_by, arguments))
+        caption = f"{title}: ordered values against normal quantiles; on the line they are normal{detector}."
+        found.append(Drawing(f"qq-{stem}", "qq", caption, qq, (part, config)))
+    own = [c for c in cells if c.detector == first]
+    if config.tracks and own:
+        caption = f"Tracks seen from above: start at the cross, dots where they end{detector}."
+        if any(c.clipped for c in own):
+            caption += " Dashed: clipped input."
+        found.append(Drawing("tracks", "tracks", caption, tracks, (own, config)))
     pooled = nees.filter((pl.col("configuration") == "") & (pl.col("detector") == first))
     if len(pooled):
-        yield "consistency", "consistency", f"Mean NEES over all walks{with_detector}.", consistency(pooled)
+        caption = f"Mean NEES over all walks{detector}; above the band a filter is too sure of itself."
+        found.append(Drawing("consistency", "consistency", caption, consistency, (pooled,)))
+    return found
 
 
-def draw_all(
-    folder: Path, frame: pl.DataFrame, cells: Sequence[Cell], nees: pl.DataFrame, config: cfg.StudyConfig
-) -> tuple[list[Picture], list[Path]]:
-    """Draw every figure and write it as PNG and SVG.
-
-    Returns
-    -------
-    (list of Picture, list of Path)
-        The pictures for the report, and all files written; older figures in the folder are removed.
-    """
+def render_drawing(drawing: Drawing) -> Picture | None:
+    """Draw one figure as PNG and SVG; None where there is nothing to see."""
     import matplotlib
 
-    pictures: list[Picture] = []
-    files: list[Path] = []
-    with matplotlib.rc_context({**matplotlib.rcParamsDefault, **STYLE}):
-        for name, section, caption, figure in _figures(frame, cells, nees, config):
-            if figure is None:
-                continue
-            for suffix in (".png", ".svg"):
-                data = io.BytesIO()
-                metadata = {"Date": None} if suffix == ".svg" else {}
-                figure.savefig(data, format=suffix[1:], dpi=120, metadata=metadata)
-                path = folder / f"{name}{suffix}"
-                write_atomic(path, lambda part, data=data: part.write_bytes(data.getvalue()))
-                files.append(path)
-                if suffix == ".png":
-                    pictures.append(Picture(name, section, caption, data.getvalue()))
-    for old in {*folder.glob("*.png"), *folder.glob("*.svg")} - set(files):
-        old.unlink()
-    return pictures, files
+    with matplotlib.rc_context(matplotlib.rcParamsDefault | STYLE):
+        figure = drawing.function(*drawing.arguments)
+        if figure is None:
+            return None
+        figure.draw_without_rendering()  # lays it out, once for both formats
+        figure.set_layout_engine("none")
+        png, svg = io.BytesIO(), io.BytesIO()
+        figure.savefig(png, format="png", dpi=120)
+        figure.savefig(svg, format="svg", metadata={"Date": None})
+    return Picture(drawing.name, drawing.section, drawing.caption, png.getvalue(), svg.getvalue())
+
+
+def draw(
+    executor: Executor, material: Material, cells: Sequence[Cell], config: cfg.StudyConfig
+) -> list[Picture]:
+    """Draw every figure, by the processes that are there."""
+    todo = drawings(material, cells, config)
+    done: dict[str, Picture | None] = {}
+    for drawing, outcome in executor.run(render_drawing, todo):
+        if isinstance(outcome, Exception):
+            raise outcome
+        done[drawing.name] = outcome
+    return [picture for d in todo if (picture := done[d.name]) is not None]

@@ -28,7 +28,7 @@ class Picture(msgspec.Struct, frozen=True):
         Part of the report that it belongs to.
     caption : str
         What it shows, for the report and for readers who cannot see it.
-    png : bytes
+    png, svg : bytes
         The picture.
     """
 
@@ -36,6 +36,7 @@ class Picture(msgspec.Struct, frozen=True):
     section: str
     caption: str
     png: bytes
+    svg: bytes
 
 
 class Material(msgspec.Struct, frozen=True):
@@ -47,8 +48,6 @@ class Material(msgspec.Struct, frozen=True):
         The study.
     results, values, groups, comparisons, outliers, published, consistency : polars.DataFrame
         Tables of :mod:`~marcha.replay.study.analysis`.
-    pictures : list of Picture
-        Drawn figures.
     notes : list of str
         What a reader must know before the numbers.
     provenance : dict
@@ -65,7 +64,6 @@ class Material(msgspec.Struct, frozen=True):
     outliers: pl.DataFrame
     published: pl.DataFrame
     consistency: pl.DataFrame
-    pictures: list[Picture]
     notes: list[str]
     provenance: dict[str, Any]
     toml: str
@@ -172,7 +170,7 @@ class Html:
         return "\n".join([*self.parts[:first], f"<nav>{links}</nav>", *self.parts[first:]])
 
 
-def render(material: Material) -> str:
+def render(material: Material, pictures: Sequence[Picture]) -> str:
     """Return the report as one HTML page."""
     html = Html()
     _introduction(html, material)
@@ -182,10 +180,10 @@ def render(material: Material) -> str:
         if len(levels["detector"]) > 1 or material.values["clipped"].n_unique() > 1:
             _methods(html, material, levels)
         for title, section in (("Box plots", "box"), ("Tracks", "tracks"), ("Run time", "run time")):
-            _gallery(html, material, title, section)
+            _gallery(html, pictures, title, section)
         if len(material.consistency):
-            _consistency(html, material)
-        _normality(html, material)
+            _consistency(html, material, pictures)
+        _normality(html, material, pictures)
         _comparisons(html, material)
         _outliers(html, material)
     _origin(html, material)
@@ -255,7 +253,7 @@ def _means(html: Html, material: Material, levels: dict[str, list[str]]) -> None
             known = [beside.get((title, name, first, c)) for c in levels["configuration"]]
             if any(v is not None for v in known):
                 cells = [f"@published {number(v, 4)}" for v in known]
-                rows.append(["@published &emsp;published", *cells, "@published "])
+                rows.append(["@published published", *cells, "@published "])
         html.table(["filter", *levels["configuration"], "all"], rows)
         for table in tables:
             html.text(f"Published: {table.origin} {table.note}".strip(), "note")
@@ -316,19 +314,19 @@ def _methods(html: Html, material: Material, levels: dict[str, list[str]]) -> No
     html.table(["filter", "detector", *head, "n"], rows, 2)
 
 
-def _gallery(html: Html, material: Material, title: str, section: str) -> None:
-    pictures = [p for p in material.pictures if p.section == section]
+def _gallery(html: Html, pictures: Sequence[Picture], title: str, section: str) -> None:
+    pictures = [p for p in pictures if p.section == section]
     if pictures:
         html.section(title)
         if section == "box":
             html.text(
                 "Box: quartiles and median; whiskers: last value within 1.5 interquartile ranges; diamond: mean; "
-                "dots: single values (all of them in groups below 20). Outliers of the sigma rule are left out."
+                "dots: single values (all of them in groups below 20; groups below 5 have no box). Outliers of the sigma rule are left out."
             )
         html.pictures(pictures)
 
 
-def _consistency(html: Html, material: Material) -> None:
+def _consistency(html: Html, material: Material, pictures: Sequence[Picture]) -> None:
     html.section("Consistency of the filters' own covariance")
     html.text(
         "NEES: the squared error at the end of the walk in units of the filter's covariance. Its mean over independent "
@@ -351,10 +349,10 @@ def _consistency(html: Html, material: Material) -> None:
     ]
     head = ["filter", "detector", "configuration", "error", "mean", "median", "consistent", "n", "verdict"]
     html.table(head, rows, 4)
-    html.pictures(p for p in material.pictures if p.section == "consistency")
+    html.pictures(p for p in pictures if p.section == "consistency")
 
 
-def _normality(html: Html, material: Material) -> None:
+def _normality(html: Html, material: Material, pictures: Sequence[Picture]) -> None:
     html.section("Normality")
     level = 1 - material.config.statistics.confidence
     tested = material.groups.filter(
@@ -384,7 +382,7 @@ def _normality(html: Html, material: Material) -> None:
         ]
         head = ["metric", "filter", "detector", "configuration", "n", "W", "p"]
         _folded(html, f"{len(rows)} groups", head, rows, 4)
-    html.pictures(p for p in material.pictures if p.section == "qq")
+    html.pictures(p for p in pictures if p.section == "qq")
 
 
 def _reasons(frame: pl.DataFrame) -> str:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -188,7 +188,7 @@ def compare(
     if x.std(ddof=1) + y.std(ddof=1) <= 1e-12 * scale:
         difference = float(x.mean() - y.mean())
         return Comparison(n, k, difference=difference, note="not tested: no spread in either group")
-    welch = stats.ttest_ind(x, y, equal_var=False)
+    welch: Any = stats.ttest_ind(x, y, equal_var=False)
     low, high = welch.confidence_interval(confidence)
     g, g_low, g_high = hedges_g(x, y, confidence)
     if nonparametric == "mann-whitney":

@@ -6,7 +6,7 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from importlib import metadata
@@ -20,10 +20,12 @@ from ...recording import MarchaError, OutputExists, UsageError
 from . import analysis, plan
 from . import config as cfg
 from .cells import Cell, Makers, cached, failed, run_task
-from .executors import cores, execute
-from .report import Material, render
+from .executors import Executor
+from .figures import draw
+from .report import Material, Picture, render
 from .store import CellStore, tidy, write_atomic
 
+TABLES = ("results", "values", "groups", "comparisons", "outliers", "published", "consistency")
 LIBRARIES = ("marcha", "numpy", "scipy", "numba", "polars", "matplotlib")
 
 
@@ -167,30 +169,38 @@ def run_study(
 
     store = CellStore(folder / "cells")
     finished = store.load()
-    processes = 1 if workers == 1 else (workers or cores())
-    todo = plan.tasks(config, sources, finished, folder / "recordings", processes)
     wanted = [(source, job) for source in sources for job in plan.jobs(config, source)]
-    total, done = len(wanted), len(wanted) - sum(len(t.jobs) for t in todo)
     reused = {job.key for _, job in wanted} & finished.keys()
-    if progress:
-        progress(done, total)
-    if scheduler is not None:
-        todo = [msgspec.structs.replace(t, folder=str(Path(t.folder).resolve())) for t in todo]
-    function = partial(run_task, Makers(convert, simulate))
-    for task, outcome in execute(function, todo, workers=workers, scheduler=scheduler):
-        cells = failed(task, outcome) if isinstance(outcome, Exception) else outcome
-        store.add(task.name, cells)
-        for cell in cells:
-            finished[cell.key] = [*finished.get(cell.key, []), cell]
-        done += len(task.jobs)
+    with Executor(workers, scheduler) as executor:
+        todo = plan.tasks(config, sources, reused, (folder / "recordings").resolve(), executor.processes)
+        total, done = len(wanted), len(wanted) - sum(len(t.jobs) for t in todo)
         if progress:
             progress(done, total)
-
-    cells = [_placed(cell, source, config) for source, job in wanted for cell in finished.get(job.key, [])]
-    _forget_old_recordings(folder / "recordings", sources)
-    run = sum(c.key not in reused for c in cells)
-    return _write(
-        folder, config, toml, cells, notes, run, started, begin, code, workers=workers, scheduler=scheduler
+        for task, outcome in executor.run(partial(run_task, Makers(convert, simulate)), todo):
+            cells = failed(task, outcome) if isinstance(outcome, Exception) else outcome
+            store.add(task.name, cells)
+            for job in task.jobs:
+                finished[job.key] = [cell for cell in cells if cell.key == job.key]
+            done += len(task.jobs)
+            if progress:
+                progress(done, total)
+        cells = [_placed(cell, source, config) for source, job in wanted for cell in finished[job.key]]
+        _forget_old_recordings(folder / "recordings", sources)
+        analysed = _analyse(
+            config, toml, cells, notes, code, started, scheduler or f"{executor.processes} processes"
+        )
+        pictures = draw(executor, analysed, cells, config)
+    files = _write(folder, analysed, pictures)
+    return StudyResult(
+        folder=folder,
+        config=config,
+        **{name: getattr(analysed, name) for name in TABLES},
+        cells_run=sum(c.key not in reused for c in cells),
+        cells_reused=sum(c.key in reused for c in cells),
+        cells_failed=sum(c.status != "ok" for c in cells),
+        elapsed_s=time.perf_counter() - begin,
+        notes=analysed.notes,
+        files=files,
     )
 
 
@@ -237,87 +247,63 @@ def _forget_old_recordings(folder: Path, sources: Sequence[plan.Source]) -> None
             path.unlink()
 
 
-def _write(
-    folder: Path,
+def _analyse(
     config: cfg.StudyConfig,
     toml: str,
     cells: list[Cell],
     notes: list[str],
-    run: int,
-    started: datetime,
-    begin: float,
     code: str,
-    *,
-    workers: int | None,
-    scheduler: str | None,
-) -> StudyResult:
-    from .figures import draw_all
-
+    started: datetime,
+    executor: str,
+) -> Material:
+    """Return everything that the report says, but the pictures."""
     results = tidy(cells)
     values = analysis.values(results, config)
     groups = analysis.groups(values, config)
-    consistency = analysis.consistency(results, config)
-    comparisons = analysis.comparisons(values, config)
-    outliers = analysis.outliers(values)
-    published = analysis.beside_published(groups, config)
-    notes = [*notes, *analysis.remarks(cells, config)]
-    pictures, drawn = draw_all(folder / "figures", values, cells, consistency, config)
-    provenance = {
-        "started (UTC)": started.isoformat(timespec="seconds"),
-        "cells computed now": run,
-        "cells reused": len(cells) - run,
-        "executor": scheduler or f"{workers or cores()} processes",
-        "code hash": code,
-        "Python": platform.python_version(),
-        "system": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-        **{name: metadata.version(name) for name in LIBRARIES},
-    }
-    page = render(
-        Material(
-            config=config,
-            results=results,
-            values=values,
-            groups=groups,
-            comparisons=comparisons,
-            outliers=outliers,
-            published=published,
-            consistency=consistency,
-            pictures=pictures,
-            notes=notes,
-            provenance=provenance,
-            toml=toml,
-        )
+    return Material(
+        config=config,
+        results=results,
+        values=values,
+        groups=groups,
+        comparisons=analysis.comparisons(values, config),
+        outliers=analysis.outliers(values),
+        published=analysis.beside_published(groups, config),
+        consistency=analysis.consistency(results, config),
+        notes=[*notes, *analysis.remarks(cells, config)],
+        provenance={
+            "started (UTC)": started.isoformat(timespec="seconds"),
+            "executor": executor,
+            "code hash": code,
+            "Python": platform.python_version(),
+            "system": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+            **{name: metadata.version(name) for name in LIBRARIES},
+        },
+        toml=toml,
     )
-    writers: Mapping[str, Callable[[Path], object]] = {
-        "results.parquet": results.write_parquet,
-        "results.csv": results.write_csv,
-        "groups.csv": groups.write_csv,
-        "comparisons.csv": comparisons.write_csv,
-        "outliers.csv": outliers.write_csv,
-        "provenance.json": lambda path: path.write_bytes(
-            msgspec.json.format(msgspec.json.encode(provenance))
-        ),
+
+
+def _write(folder: Path, material: Material, pictures: list[Picture]) -> list[Path]:
+    """Write tables, figures and report; return the files. Older figures are removed."""
+    page = render(material, pictures)
+    provenance = msgspec.json.format(msgspec.json.encode(material.provenance))
+    writers: dict[str, Callable[[Path], object]] = {
+        "results.parquet": material.results.write_parquet,
+        "results.csv": material.results.write_csv,
+        "groups.csv": material.groups.write_csv,
+        "comparisons.csv": material.comparisons.write_csv,
+        "outliers.csv": material.outliers.write_csv,
+        "provenance.json": lambda path: path.write_bytes(provenance),
         "report.html": lambda path: path.write_text(page, encoding="utf-8"),
     }
+    for picture in pictures:
+        writers[f"figures/{picture.name}.png"] = lambda path, data=picture.png: path.write_bytes(data)
+        writers[f"figures/{picture.name}.svg"] = lambda path, data=picture.svg: path.write_bytes(data)
     for name, write in writers.items():
         try:
             write_atomic(folder / name, write)
         except OSError as error:
             raise MarchaError(f"{folder / name}: cannot be written: {error.strerror or error}") from None
-    return StudyResult(
-        folder=folder,
-        config=config,
-        results=results,
-        values=values,
-        groups=groups,
-        comparisons=comparisons,
-        outliers=outliers,
-        published=published,
-        consistency=consistency,
-        cells_run=run,
-        cells_reused=len(cells) - run,
-        cells_failed=sum(c.status != "ok" for c in cells),
-        elapsed_s=time.perf_counter() - begin,
-        notes=notes,
-        files=[*(folder / name for name in ("study.toml", *writers)), *drawn],
-    )
+    files = [folder / name for name in ("study.toml", *writers)]
+    for old in {*folder.glob("figures/*.png"), *folder.glob("figures/*.svg")} - set(files):
+        old.unlink()
+    return files
