@@ -17,6 +17,7 @@ from ..recording.errors import MarchaError, UsageError
 from .checks import STANDARD_GRAVITY, SensorCheck
 from .clock import Clock
 from .contract import ChannelSpec, ReportBuilder
+from .units import conversion
 
 IMU = "sensor_msgs/msg/Imu"
 MAG = "sensor_msgs/msg/MagneticField"
@@ -24,14 +25,8 @@ ACC = ("acc_x", "acc_y", "acc_z")
 GYR = ("gyr_x", "gyr_y", "gyr_z")
 FIELD = ("mag_x", "mag_y", "mag_z")
 
-UNITS: dict[str, dict[str, float]] = {
-    "acc": {"g": STANDARD_GRAVITY, "m/s^2": 1.0, "m/s/s": 1.0, "m/s²": 1.0, "m/s2": 1.0},
-    "gyr": {"deg/s": math.pi / 180, "°/s": math.pi / 180, "dps": math.pi / 180, "rad/s": 1.0},
-    "mag": {"g": 1e-4, "gauss": 1e-4, "ut": 1e-6, "µt": 1e-6, "μt": 1e-6, "mt": 1e-3, "t": 1.0},
-    "t": {"s": 1e9, "ms": 1e6, "us": 1e3, "µs": 1e3, "μs": 1e3, "ns": 1.0},
-}
-"""Factor from a unit (lower case) to SI, time to nanoseconds."""
-
+SI = {"acc": "m/s²", "gyr": "rad/s", "mag": "T", "t": "ns"}
+"""Unit of the recording for each quantity of a header."""
 FULL_SCALES = {
     "acc": ("g", STANDARD_GRAVITY, (2.0, 4.0, 5.0, 8.0, 10.0, 16.0, 24.0, 32.0)),
     "gyr": ("°/s", math.pi / 180, (125.0, 250.0, 500.0, 1000.0, 2000.0, 4000.0)),
@@ -64,10 +59,12 @@ class Source(NamedTuple):
 def x_io_columns(path: Path, names: Sequence[str], line: int) -> dict[str, Source]:
     """Return the columns that x-io's headers name (``Gyroscope X (deg/s)``), and ``t`` of ``Time (s)``.
 
+    A magnetometer in arbitrary units is none.
+
     Raises
     ------
     MarchaError
-        A unit is unknown.
+        The unit of an acceleration, angular rate or time is unknown.
     """
     found: dict[str, Source] = {}
     for name in names:
@@ -82,25 +79,16 @@ def x_io_columns(path: Path, names: Sequence[str], line: int) -> dict[str, Sourc
             column = f"{quantity}_{match['axis'].lower()}"
         else:
             continue
-        found[column] = Source(name, factor(path, line, name, quantity, match["unit"] or ""))
+        try:
+            scale, _ = conversion(match["unit"] or "", SI[quantity])
+        except UsageError as error:
+            if quantity == "mag":  # arbitrary units (x-IMU3): no field strength, so it is left out
+                continue
+            raise MarchaError(
+                f"{path}, line {line}: column {name!r}: {error}; or import it with --map"
+            ) from None
+        found[column] = Source(name, scale)
     return found
-
-
-def factor(path: Path, line: int, name: str, quantity: str, unit: str) -> float:
-    """Return the factor of a unit of ``acc``, ``gyr``, ``mag`` or ``t`` to SI (time: ns).
-
-    Raises
-    ------
-    MarchaError
-        The unit is unknown.
-    """
-    known = UNITS[quantity]
-    if unit.lower() not in known:
-        raise MarchaError(
-            f"{path}, line {line}: column {name!r}: unit {unit!r} is none of {', '.join(known)}; "
-            "import it with a mapping (--map)"
-        )
-    return known[unit.lower()]
 
 
 @dataclass(frozen=True)

@@ -34,16 +34,17 @@ from .inertial import (
     IMU,
     MAG,
     MIRRORS,
+    SI,
     Mirror,
     Plan,
     Source,
     complete,
     drop_untimed,
-    factor,
     note_mirror,
     note_unused,
     tables,
 )
+from .units import conversion
 
 WANTED = "Time,<node>:scaledAccelX,…"
 FOOTPRINTS = ("strideIndex", "timestamp", "gcpX", "gcpY")
@@ -99,7 +100,7 @@ class SensorConnectCsv:
         path, truth = _inputs(paths, options)
         header = require_header(path, _is_header, WANTED)
         node = _node(path, header, options.node)
-        columns = _columns(path, header, node)
+        columns = _columns(header, node)
         report = ReportBuilder()
         angles = {a: f"{node}:{a}" for a in _ANGLES if f"{node}:{a}" in header.names}
         imu = complete(columns, ACC) | complete(columns, GYR)
@@ -184,15 +185,14 @@ def _node(path: Path, header: Header, wanted: str | None) -> str:
     raise UsageError(f"{path}: {said}; choose one with node=: {', '.join(nodes)}")
 
 
-def _columns(path: Path, header: Header, node: str) -> dict[str, Source]:
+def _columns(header: Header, node: str) -> dict[str, Source]:
     found = {}
     for name in header.names:
         field = name.removeprefix(f"{node}:")
         if field[:-1] in _FIELDS and field[-1] in "XYZ":
             quantity, unit = _FIELDS[field[:-1]]
-            found[f"{quantity}_{field[-1].lower()}"] = Source(
-                name, factor(path, header.line, name, quantity, unit)
-            )
+            factor, _ = conversion(unit, SI[quantity])
+            found[f"{quantity}_{field[-1].lower()}"] = Source(name, factor)
     return found
 
 
