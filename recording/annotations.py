@@ -32,12 +32,13 @@ def check_annotations(table: pl.DataFrame) -> pl.DataFrame:
     Parameters
     ----------
     table : polars.DataFrame
-        ``tier``, ``start_ns``, ``end_ns`` (inclusive, both), ``label``; optional ``metadata``: JSON text, a struct, or null.
+        ``tier``, ``start_ns``, ``end_ns`` (inclusive, both), ``label``; optional ``metadata``: JSON text, a
+        struct, or null.
 
     Raises
     ------
     MarchaError
-        A column is missing, unknown or of the wrong type, an interval ends before it starts, a tier is not one
+        A column is missing, unknown or of the wrong type, an interval ends before it starts, a tier is no
         part of a topic, or metadata is not an object.
     """
     if "metadata" not in table.columns:
@@ -52,7 +53,7 @@ def check_annotations(table: pl.DataFrame) -> pl.DataFrame:
             raise MarchaError(f"annotations: column {name!r}: type {table.schema[name]}, must be {kind}")
         if table[name].null_count():
             raise MarchaError(f"annotations: column {name!r} has nulls")
-    table = table.cast(COLUMNS)
+    table = table.cast(COLUMNS)  # an empty table may have any types  # pyright: ignore[reportArgumentType]
     bad = table.filter(
         (pl.col("end_ns") < pl.col("start_ns")) | (pl.col("start_ns") < 0) | (pl.col("end_ns") > MAX_TIME_NS)
     )
@@ -111,7 +112,7 @@ def encode_events(rows: pl.DataFrame, channel_id: int) -> Iterator[tuple[int, by
 
 
 class EventDecoder:
-    """Decodes annotation messages into ``start_ns, end_ns, label, metadata``; see :class:`~.codec.Decoder`."""
+    """Decodes annotation messages into ``start_ns, end_ns, label, metadata``; see ``codec.Decoder``."""
 
     def __init__(self, library: Library) -> None:
         self.library = library

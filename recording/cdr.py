@@ -1,9 +1,9 @@
 """CDR byte layout of messages, derived from their definitions.
 
-A message has a fixed layout once the lengths of its strings and sequences are given. :class:`Layout` holds it as a
-NumPy structured type that covers the whole message, encapsulation included, so that a block of equal messages is
-encoded or decoded as columns. Alignment counts from byte 4, behind the encapsulation; an empty sequence gets
-no padding for its element type. (OMG DDS-RTPS 9.4.2, XCDR1; checked against rosbags.)
+A message has a fixed layout once the lengths of its strings and sequences are given. :class:`Layout` holds
+it as a NumPy structured type that covers the whole message, encapsulation included, so that a block of equal
+messages is encoded or decoded as columns. Alignment counts from byte 4, behind the encapsulation; an empty
+sequence gets no padding for its element type. (OMG DDS-RTPS 9.4.2, XCDR1; checked against rosbags.)
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ class Layout:
         return record
 
     def fits(self, block: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which messages of ``block`` (structured view with this layout) have this layout's lengths."""
+        """Return which messages of ``block`` (a view with this layout's type) have this layout's lengths."""
         good = block["#"] == _ENCAPSULATION_WORD[self.order]
         for path, count in self.counts.items():
             good &= block[f"{path}#"] == count
@@ -151,7 +151,7 @@ class Layout:
         return block[base][..., index]
 
     def text(self, block: NDArray[Any], path: str) -> str | None:
-        """Return the string at ``path`` in the first message of ``block``, "" where empty, None where not there."""
+        """Return the string at ``path`` in the first message of ``block``; None where there is none."""
         if path not in self.counts or path in self.sequences:
             return None
         if self.counts[path] == 0:
@@ -235,6 +235,10 @@ def encode(value: Mapping[str, Any], definition: Definition, library: Library) -
     ----------
     value : mapping
         Field name to value; nested mappings for messages, sequences for arrays. Every field must be there.
+    definition : Definition
+        The message type.
+    library : Library
+        It and all types that it uses.
 
     Raises
     ------

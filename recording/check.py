@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 
 from .errors import Finding
+from .integrity import structure
 
 if TYPE_CHECKING:
     from .reader import Channel, Recording
@@ -42,19 +43,20 @@ def check(rec: Recording) -> list[Finding]:
     Returns
     -------
     list of Finding
-        First what was lost in opening it, then by channel ``empty_channel``, ``backwards_time``, ``duplicate_time``,
-        ``gap``, ``missing_cell`` and ``all_zero``. ``first_line`` is the row of the channel, from 1. Estimates are
-        looked at for emptiness only: their missing values are the estimator's to explain.
+        First what was lost in reading it, then what the structure shows (:mod:`~.integrity`), then by
+        channel ``empty_channel``, ``backwards_time``, ``duplicate_time``, ``gap``, ``missing_cell`` and ``all_zero``.
+        ``first_line`` is the row of the channel, from 1. Estimates are looked at for emptiness only: their
+        missing values are the estimator's to explain.
     """
-    found = list(rec.findings)
+    found = structure(rec)
     if not rec.channels:
         found.append(Finding("empty_recording", 1, None, "there is no channel in it"))
     for channel in rec.channels.values():
         if not channel.count:
             found.append(Finding("empty_channel", 1, None, f"{channel.topic}: has no message"))
-        elif not channel.topic.startswith(ESTIMATE):
+        elif channel.columns and not channel.topic.startswith(ESTIMATE):
             found += _Watch(channel).run(rec)
-    return found
+    return [*rec.findings, *found]
 
 
 class _Tally:

@@ -1,4 +1,4 @@
-"""Chunks of a file: finding them through the summary or by scanning, reading them, splitting them by channel."""
+"""Chunks of a file: found through the summary or by scanning, read, and split by channel."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import zstandard
@@ -345,8 +345,18 @@ def _scan_attachment(file: FileReader, at: int, length: int, contents: Contents)
 _local = threading.local()
 
 
-def read_chunk(file: FileReader, ref: ChunkRef) -> NDArray[np.uint8]:
+def read_chunk(file: FileReader, ref: ChunkRef, reuse: bool = False) -> NDArray[np.uint8]:
     """Return the decompressed records of a chunk, its checksum verified.
+
+    Parameters
+    ----------
+    file : FileReader
+        The file.
+    ref : ChunkRef
+        Where the chunk lies.
+    reuse : bool
+        Whether the bytes may lie in a buffer that this thread's next call overwrites. Fresh memory for every
+        chunk costs as much as decompressing it.
 
     Raises
     ------
@@ -360,7 +370,7 @@ def read_chunk(file: FileReader, ref: ChunkRef) -> NDArray[np.uint8]:
     where, size = f"chunk at byte {ref.start}", head.uncompressed_size
     body = memoryview(record)[head.start : head.start + head.length]
     try:
-        data = _decompress(head.compression, body, size)
+        data = _decompress(head.compression, body, size, reuse)
     except (zstandard.ZstdError, RuntimeError, MemoryError, ValueError, EOFError) as e:
         raise ChunkError(f"{where}: {head.compression}: {e}") from None
     if len(data) != size:
@@ -404,19 +414,36 @@ def chunk_head(record: bytes, ref: ChunkRef) -> ChunkHead:
     return ChunkHead(size, crc, compression, at + 8, length)
 
 
-def _decompress(compression: str, body: memoryview, size: int) -> bytes | memoryview:
+def _decompress(compression: str, body: memoryview, size: int, reuse: bool) -> bytes | memoryview:
     if compression == "":
         return body
     if compression == "zstd":
         decompressor = getattr(_local, "zstd", None)
         if decompressor is None:
             decompressor = _local.zstd = zstandard.ZstdDecompressor()
-        return decompressor.decompress(body, max_output_size=size) if size else b""
+        if not reuse:
+            return decompressor.decompress(body, max_output_size=size) if size else b""
+        with decompressor.stream_reader(body, read_size=max(1, len(body))) as stream:
+            return _fill(stream, size)
     if compression == "lz4":
         import lz4.frame
 
         return lz4.frame.decompress(body)
     raise ValueError("unknown compression")
+
+
+def _fill(stream: Any, size: int) -> memoryview:
+    """Read ``size`` bytes into this thread's buffer; the view returned is valid until the next call."""
+    buffer = getattr(_local, "buffer", None)
+    if buffer is None or len(buffer) < size:
+        buffer = _local.buffer = bytearray(size)
+    view = memoryview(buffer)[:size]
+    at = 0
+    while at < size and (n := stream.readinto(view[at:])):
+        at += n
+    if at == size and stream.read(1):
+        raise ValueError("more bytes than stated")
+    return view[:at]
 
 
 def split(
@@ -445,7 +472,7 @@ def split(
     even = _split_even(data)
     if even is not None:
         return {k: v for k, v in even.items() if wanted is None or k in wanted}
-    raw, size, at = memoryview(data), len(data), 0
+    raw, size, at = data.data, len(data), 0
     rows: dict[int, tuple[list[int], list[int]]] = {}
     unpack = _RECORD_HEAD.unpack_from
     while at + 9 <= size:

@@ -42,7 +42,7 @@ class Binding(NamedTuple):
     path: str
 
 
-# ------------------------------------------------------------------------------------------------ tables to messages
+# ---------------------------------------------------------------------------------------- tables to messages
 
 
 def resolve_columns(
@@ -381,7 +381,7 @@ def record_dtype(layout: Layout) -> np.dtype[Any]:
 
 
 def _field_type(dtype: np.dtype[Any], path: str) -> np.dtype[Any]:
-    fields = dtype.fields or {}
+    fields: dict[str, Any] = dict(dtype.fields or {})
     base, index = split_index(path)
     return fields[path if path in fields else base if index is not None else path][0].base
 
@@ -400,7 +400,7 @@ def _set_time(records: NDArray[Any], path: str, t_ns: NDArray[np.int64]) -> None
     records[f"{path}.nanosec"] = rest
 
 
-# ------------------------------------------------------------------------------------------------ messages to tables
+# ---------------------------------------------------------------------------------------- messages to tables
 
 
 class Messages(NamedTuple):
@@ -422,14 +422,14 @@ class Messages(NamedTuple):
     log: NDArray[np.int64]
     publish: NDArray[np.int64]
 
-    def take(self, keep: NDArray[Any]) -> Messages:
+    def take(self, keep: NDArray[Any] | slice) -> Messages:
         """Return the messages that ``keep`` (mask, slice or indices) picks."""
         return Messages(self.data, self.offsets[keep], self.sizes[keep], self.log[keep], self.publish[keep])
 
     def message(self, i: int) -> memoryview:
         """Return the bytes of message ``i``."""
         start = int(self.offsets[i])
-        return memoryview(self.data)[start : start + int(self.sizes[i])]
+        return self.data.data[start : start + int(self.sizes[i])]
 
 
 class Decoder:
@@ -624,7 +624,7 @@ def _flatten(layout: Layout, decoder: Decoder) -> list[Binding]:
 
 
 def _view(messages: Messages, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """Return a structured array of messages of one size: a strided view where they lie evenly, else a copy."""
+    """Return a structured array of messages of one size: a view where they lie evenly, else a copy."""
     offsets = messages.offsets
     n = len(offsets)
     stride = int(offsets[1] - offsets[0]) if n > 1 else dtype.itemsize
@@ -640,7 +640,9 @@ def _get_time(block: NDArray[Any], path: str) -> NDArray[np.int64]:
 
 def _number(layout: Layout, block: NDArray[Any], path: str) -> NDArray[Any]:
     values = layout.leaf(block, path)
-    return np.ascontiguousarray(values.astype(values.dtype.newbyteorder("="), copy=False))
+    return values.astype(
+        values.dtype.newbyteorder("="), order="C"
+    )  # always a copy: the chunk's bytes go away
 
 
 def _mac(layout: Layout, block: NDArray[Any], path: str) -> pl.Series:

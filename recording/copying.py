@@ -57,8 +57,8 @@ def _copy_channels(file: McapFile, rec: Recording, topics: Collection[str] | Non
             schema = rec.contents.schemas.get(channel.schema_id)
             if channel.message_encoding != "cdr" or schema is None:
                 raise MarchaError(
-                    f"{rec.path}: {topic}: message encoding {channel.message_encoding!r}; a recording holds only "
-                    "cdr messages; name the topics to copy"
+                    f"{rec.path}: {topic}: message encoding {channel.message_encoding!r}; a recording holds "
+                    "only cdr messages; name the topics to copy"
                 )
             if channel.topic in taken:
                 raise UsageError(

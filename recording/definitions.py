@@ -1,7 +1,7 @@
 """Message definitions: ROS 2 ``.msg`` texts parsed into field trees.
 
-The texts live in ``recording/msg/<package>/<Name>.msg``; everything else (byte layout, columns, schema records)
-is derived from them. Definitions of foreign recordings come from their own schema records.
+The texts live in ``recording/msg/<package>/<Name>.msg``; everything else (byte layout, columns, schema
+records) is derived from them. Definitions of foreign recordings come from their own schema records.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ PRIMITIVES: dict[str, str] = {
 }
 """NumPy type of every primitive of fixed size."""
 
+_PACKAGE = __name__.rpartition(".")[0]
 _SEPARATOR = "=" * 80
 _LINE = re.compile(
     r"^(?P<type>[A-Za-z][\w/]*)(?P<bound><=\d+)?(?P<array>\[(?:<=)?\d*\])?\s+"
@@ -190,7 +191,7 @@ def _require(field: Field, library: dict[str, Definition]) -> None:
 
 def _text(name: str) -> str:
     package, _, base = short_name(name).partition("/")
-    file = resources.files(__package__).joinpath("msg", package, f"{base}.msg")
+    file = resources.files(_PACKAGE).joinpath("msg", package, f"{base}.msg")
     try:
         return file.read_text(encoding="utf-8")
     except (FileNotFoundError, NotADirectoryError):
@@ -224,7 +225,7 @@ def full_text(name: str) -> str:
 
 def known_types() -> Iterator[str]:
     """Yield ``package/Name`` of every definition kept here."""
-    root = resources.files(__package__).joinpath("msg")
+    root = resources.files(_PACKAGE).joinpath("msg")
     for package in sorted(root.iterdir(), key=lambda p: p.name):
         for file in sorted(package.iterdir(), key=lambda p: p.name):
             if file.name.endswith(".msg"):

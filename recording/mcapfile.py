@@ -1,4 +1,4 @@
-"""An MCAP file being written: records, chunks, indexes, statistics and checksums, on mcap's record classes."""
+"""An MCAP file being written: records, chunks, indexes and checksums, on mcap's record classes."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ class McapFile:
         self._attachments[name] = AttachmentIndex(start, self._at - start, 0, 0, len(data), name, media_type)
 
     def submit(self, pack: Callable[..., Packed], *args: Any) -> None:
-        """Have ``pack(*args)`` make a chunk in a worker thread; chunks enter the file in the order submitted."""
+        """Have ``pack(*args)`` make a chunk in a worker thread; they enter the file in that order."""
         self._jobs.append(self._pool.submit(pack, *args))
         while len(self._jobs) > _QUEUE:
             self.put(self._jobs.popleft().result())
@@ -234,7 +234,7 @@ def pack(data: Bytes, channel_id: int, log: NDArray[np.int64], offsets: NDArray[
     log, offsets : ndarray of int64, shape (n,)
         Log time and first byte of every record.
     """
-    raw = memoryview(data)
+    raw = data.data
     compressed = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(raw)
     first, last = int(log.min()), int(log.max())
     chunk = RecordBuilder()

@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -85,7 +86,7 @@ class Window(NamedTuple):
     start_ns, end_ns : int
         ``start_ns <= t_log_ns < end_ns`` for every row.
     tables : dict of str to polars.DataFrame
-        Topic to table with ``t_ns``, ``t_log_ns`` and the channel's columns; channels without rows are not there.
+        Topic to table with ``t_ns``, ``t_log_ns`` and the channel's columns; empty ones are not there.
     """
 
     start_ns: int
@@ -150,7 +151,7 @@ class Recording:
         """Close the file."""
         self.file.close()
 
-    # ------------------------------------------------------------------------------------------------ what is inside
+    # ------------------------------------------------------------------------------------ what is inside
 
     @property
     def start_ns(self) -> int:
@@ -398,7 +399,7 @@ class Recording:
     def chunk_refs(
         self, ids: set[int], start_ns: int | None = None, end_ns: int | None = None
     ) -> list[ChunkRef]:
-        """Return the chunks that may hold messages of these channel ids in a range of log time, in file order."""
+        """Return the chunks that may hold messages of these channels in a range of log time."""
         return [
             c
             for c in self.contents.chunks
@@ -413,7 +414,7 @@ class Recording:
         """Return the rows of one chunk by topic; a broken chunk gives none and a finding."""
         topic_of = {i: s for s in sources for i in s.ids}
         try:
-            parts = split(read_chunk(self.file, ref), topic_of)
+            parts = split(read_chunk(self.file, ref, reuse=True), topic_of)  # a table holds copies
         except ChunkError as e:
             self.lost(ref, str(e))
             return {}
@@ -468,7 +469,7 @@ class Recording:
                 left = int(np.searchsorted(times, times[at], side="left"))
                 at = left if times[at] > cuts[-1] else int(np.searchsorted(times, times[at], side="right"))
             cuts.append(int(times[at]) if at < len(times) else int(times[-1]) + 1)
-        for start, end in zip(cuts, cuts[1:], strict=False):
+        for start, end in pairwise(cuts):
             tables = {}
             for topic, table in ready.items():
                 log = table["t_log_ns"]

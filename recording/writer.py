@@ -102,7 +102,7 @@ class Writer:
         frame_id : str
             Frame of every message.
         columns : sequence of str, optional
-            Columns of the tables to come, without ``t_ns`` and ``t_log_ns``; default: those of the first table.
+            Columns of the tables to come, without ``t_ns`` and ``t_log_ns``; default: the first table's.
         metadata : mapping of str to str, optional
             Anything to say about the channel.
 
@@ -179,8 +179,8 @@ class Writer:
         if (steps < 0).any():
             bad = int(np.argmax(steps < 0))
             raise MarchaError(
-                f"{where}: row {bad}: log time {log[bad]} ns is before the previous row's {log[bad] - steps[bad]}; "
-                "sort the rows by log time"
+                f"{where}: row {bad}: log time {log[bad]} ns is before the previous row's "
+                f"{log[bad] - steps[bad]}; sort the rows by log time"
             )
         try:
             arrays = out.encoder.arrays(table)
