@@ -245,8 +245,11 @@ def distance(view: RunView) -> dict[str, float]:
     if track is None:
         return {}
     found: dict[str, float] = {}
-    middles = view.stances.mean(axis=1).astype(np.int64) if len(view.stances) else np.empty(0, np.int64)
-    at = np.searchsorted(track.t_ns, middles[(middles >= track.t_ns[0]) & (middles <= track.t_ns[-1])])
+    first, last = track.t_ns[0], track.t_ns[-1]
+    stances = view.stances[(view.stances[:, 1] >= first) & (view.stances[:, 0] <= last)]
+    # The track begins within the rest at the start: that stance counts from where there is a track.
+    middles = np.clip(stances, first, last).mean(axis=1).astype(np.int64)
+    at = np.searchsorted(track.t_ns, middles)
     if at.size:
         found["distance_m"] = _length(track.position[at])
     found["path_m"] = _length(track.position)
