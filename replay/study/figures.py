@@ -344,7 +344,9 @@ def render_drawing(drawing: Drawing) -> Picture | None:
         figure = drawing.function(*drawing.arguments)
         if figure is None:
             return None
-        figure.draw_without_rendering()  # lays it out, once for both formats
+        engine = figure.get_layout_engine()
+        if engine is not None:  # laid out once for both formats
+            engine.execute(figure)
         figure.set_layout_engine("none")
         png, svg = io.BytesIO(), io.BytesIO()
         figure.savefig(png, format="png", dpi=120)
