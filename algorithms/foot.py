@@ -21,6 +21,7 @@ from .detectors import PITCH, decide, record, start_tilt, track_tilt
 from .layout import (
     BIAS_GYR,
     C_HI,
+    DECIDED,
     INIT_INDEX,
     KIND,
     LATENCY,
@@ -248,6 +249,7 @@ def take(s: FloatArray, row: FloatArray) -> bool:
         s[r + R_PITCH] = math.nan
     elif s[KIND] == PITCH:
         track_tilt(s, r)
+    s[DECIDED] = k
     decide(s, k, k)
     return k >= int(s[LATENCY])
 
@@ -259,8 +261,10 @@ def take_end(s: FloatArray) -> bool:
     j = int(s[RELEASED])
     if j > last:
         return False
-    # Rows that were fewer than the latency leave stages behind that never ran: advance one virtual row at a time.
-    decide(s, j + int(s[LATENCY]), last)
+    # Where fewer rows came than the latency, stages are behind by more than one row.
+    while s[DECIDED] < j + s[LATENCY]:
+        s[DECIDED] += 1.0
+        decide(s, int(s[DECIDED]), last)
     return True
 
 

@@ -42,6 +42,7 @@ RING_MASK = _take()  # length − 1; the length is a power of two
 
 # Counters
 TAKEN = _take()  # rows taken
+DECIDED = _take()  # row up to which the detector's stages have come; runs past the end in a flush
 RELEASED = _take()  # samples handed to the filter
 LAST_ONE = _take()  # newest raw "still" at or before the sample being filled, −1 none
 BURST_START = _take()  # first sample of the run of filled "still" that is being cleaned

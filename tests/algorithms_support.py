@@ -23,7 +23,9 @@ def _simulated(scenario: str, seed: int, sensor: Any, options: tuple) -> tuple[n
     return rows_of(walk.t, *walk.measured()), walk
 
 
-def simulated(scenario: str = "rectangle", seed: int = 1, sensor: int = 2, **options: Any) -> tuple[np.ndarray, Any]:
+def simulated(
+    scenario: str = "rectangle", seed: int = 1, sensor: int = 2, **options: Any
+) -> tuple[np.ndarray, Any]:
     """Return rows and truth of a simulated walk; the rows are the caller's own."""
     rows, walk = _simulated(scenario, seed, sensor, tuple(sorted(options.items())))
     return rows.copy(), walk

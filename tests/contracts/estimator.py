@@ -125,7 +125,9 @@ class EstimatorContract:
         single = results_of(self.make(), rows)
         for size in (len(rows), 1, 7, 64):
             block, got = self.make(), np.full((len(rows), width), 7.0)
-            count = sum(block.run_block(rows[i : i + size], got[i : i + size]) for i in range(0, len(rows), size))
+            count = sum(
+                block.run_block(rows[i : i + size], got[i : i + size]) for i in range(0, len(rows), size)
+            )
             assert count == sum(r is not None for r in single[: len(rows)])
             wanted = np.array([np.full(width, np.nan) if r is None else r for r in single[: len(rows)]])
             assert got.tobytes() == wanted.tobytes()
