@@ -73,6 +73,7 @@ class Clock:
         self._subject = subject
         self._even = even
         self._raw: int | None = None  # last raw tick
+        self._raw_step = 0  # and the step to it
         self._turns = 0  # ticks added by roll-overs
         self._shift = 0  # ticks added by restarts
         self._last: int | None = None  # last tick handed out, after both
@@ -99,8 +100,7 @@ class Clock:
             steps = np.diff(ticks)
             steps = steps[steps > 0]
             self._nominal = int(np.median(steps)) if steps.size else None
-        before = ticks[0] if self._last is None and ticks.size else self._last
-        steps = np.diff(ticks, prepend=before) if ticks.size else ticks
+        steps = np.diff(ticks, prepend=ticks[:1] if self._last is None else self._last)
         if steps.size and (steps[1:].min(initial=1) <= 0 or steps[0] < 0 or steps.max() > self._jump):
             frame, ticks = self._settle(frame, ticks, steps, final)
         elif self._last is not None and steps.size and steps[0] == 0:
@@ -127,7 +127,9 @@ class Clock:
             return raw
         steps = np.diff(raw, prepend=raw[0] if self._raw is None else self._raw)
         window = ROLLOVER_S * 1e9 / self._tick_ns
-        wraps = np.flatnonzero((steps < 0) & (steps + self._period < window))
+        into = np.concatenate(([self._raw_step], steps[:-1]))  # a damaged number is a leap, a counter creeps
+        wraps = np.flatnonzero((steps < 0) & (steps + self._period < window) & (np.abs(into) < window))
+        self._raw_step = int(steps[-1])
         self._raw = int(raw[-1])
         out = raw + self._turns
         for i in wraps:
