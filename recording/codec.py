@@ -381,7 +381,7 @@ def record_dtype(layout: Layout) -> np.dtype[Any]:
 
 
 def _field_type(dtype: np.dtype[Any], path: str) -> np.dtype[Any]:
-    fields: dict[str, Any] = dict(dtype.fields or {})
+    fields: Any = dtype.fields
     base, index = split_index(path)
     return fields[path if path in fields else base if index is not None else path][0].base
 
