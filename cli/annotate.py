@@ -1,4 +1,4 @@
-"""``marcha annotate add|import|list``: intervals with a label; never changes a file while it is being read."""
+"""``marcha annotate add|import|list``: labelled intervals; a file is never changed in place."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def import_(
     path : Path
         The recording.
     table : Path
-        Columns onset and duration [s since the recording's start] or start_ns and end_ns; trial_type or label;
+        Columns onset, duration [s, from the recording's start] or start_ns, end_ns; trial_type or label;
         optionally tier and metadata.
     tier : str
         Tier of rows that name none; the table's file name without it.

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
 from cyclopts import App, CycloptsError, Group, Parameter
 
-from .console import Outcome, complain, emit, emit_json
+from .console import Outcome, complain, emit, emit_json, warn
 from .errors import DONE, FAILED, INTERRUPTED, USAGE, expected
 
 EPILOGUE = (
@@ -84,7 +85,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     as_json = "--json" in tokens[: tokens.index("--")] if "--" in tokens else "--json" in tokens
     try:
         overview = not tokens or tokens[0].startswith("-")
-        result = build(overview=overview)(tokens, exit_on_error=False, print_error=False)
+        with warnings.catch_warnings():
+            warnings.showwarning = warn
+            result = build(overview=overview)(tokens, exit_on_error=False, print_error=False)
         code = _finish(result, as_json=as_json)
         sys.stdout.flush()
         return code

@@ -11,6 +11,9 @@ from typing import Any, Literal
 
 from .options import Common, plain
 
+LONGEST = 120
+"""Characters of a cell; longer values (JSON, hashes) are cut, ``--json`` has them whole."""
+
 
 @dataclass(frozen=True)
 class Heading:
@@ -61,12 +64,13 @@ def emit(outcome: Outcome, *, as_json: bool) -> None:
         return
     from rich.console import Console
 
-    out = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
+    out = Console(highlight=False, markup=False, emoji=False)
+    wide = Console(highlight=False, markup=False, emoji=False, width=10_000)  # a table is never cut to fit
     for part in outcome.lines:
         if isinstance(part, Heading):
-            out.print(part.text)
+            out.print(part.text, soft_wrap=True)
         elif part.rows:
-            out.print(_grid(part, colour=out.is_terminal), crop=False, no_wrap=True)
+            wide.print(_grid(part, colour=out.is_terminal))
 
 
 def emit_json(document: dict[str, Any]) -> None:
@@ -81,6 +85,11 @@ def complain(line: str) -> None:
     sys.stderr.write(f"marcha: {line}\n")
 
 
+def warn(message: Warning | str, category: type[Warning], *where: object) -> None:
+    """Say a warning in one line; takes the place of :func:`warnings.showwarning`."""
+    complain(f"warning: {' '.join(str(message).split())}")
+
+
 def number(value: Any) -> str:
     """Return a cell's text: counts in full, measured values with four significant digits."""
     if value is None:
@@ -91,7 +100,8 @@ def number(value: Any) -> str:
         if math.isnan(value):
             return "–"
         return f"{value:.0f}" if abs(value) >= 1e4 and math.isfinite(value) else f"{value:.4g}"
-    return str(value)
+    text = str(value)
+    return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
 
 
 def _grid(table: Table, *, colour: bool) -> Any:
@@ -124,7 +134,7 @@ Progress = Callable[[float, float], None]
 
 @contextmanager
 def progress(what: str, common: Common, *, counted: bool = False) -> Iterator[Progress | None]:
-    """Give a callback that draws a bar on standard error; None where there is no terminal or it is not wanted.
+    """Give a callback that draws a bar on standard error; None without a terminal or where not wanted.
 
     ``counted`` shows how many instead of a share: for work of unknown length.
     """

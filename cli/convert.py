@@ -142,7 +142,7 @@ def _each(paths: tuple[Path, ...], folder: Path, options: dict[str, Any], common
 
 
 def _names(logs: list[Path]) -> dict[Path, str]:
-    """Return one file name an input; two that would share a name are a usage error, nothing is renamed silently."""
+    """Return one file name an input; two that would share one are a usage error."""
     from ..recording.errors import UsageError
 
     names: dict[Path, str] = {}

@@ -33,6 +33,7 @@ MaybeOutput = Annotated[Path | None, Parameter(name=("--output", "-o"))]
 Shown = Parameter(show_default=True)
 """Marks a default that help should state; the others go without saying."""
 Strings = Annotated[tuple[str, ...], Parameter(negative="", consume_multiple=False)]
+Paths = Annotated[tuple[Path, ...], Parameter(negative="", consume_multiple=False)]
 
 _TIME = re.compile(
     r"(?P<at>@)?(?P<value>[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?)(?P<unit>ns|us|ms|s|m|min|h)?", re.IGNORECASE
@@ -92,9 +93,9 @@ def instant(text: str | None, rec: Recording, option: str) -> int | None:
     Parameters
     ----------
     text : str or None
-        ``12.5``, ``12.5s``, ``1m``, ``500ms``, ``250000ns``: that long after the start of the recording (a bare
-        number is seconds). ``@1700000000000000000``: that many nanoseconds (or another unit, ``@12.5s``) on the
-        recording's own clock. None stays None.
+        ``12.5``, ``12.5s``, ``1m``, ``500ms``, ``250000ns``: that long after the start of the recording (a
+        bare number is seconds). ``@1700000000000000000``: that many nanoseconds (or another unit,
+        ``@12.5s``) on the recording's own clock. None stays None.
     rec : Recording
         Where the start is taken from.
     option : str
@@ -114,7 +115,7 @@ def instant(text: str | None, rec: Recording, option: str) -> int | None:
     match = _TIME.fullmatch(text.strip())
     if match is None:
         raise UsageError(
-            f"{option} {text}: is not a time; give 12.5s, 1m or 500ms after the start, or @NANOSECONDS of its clock"
+            f"{option} {text}: is not a time; give 12.5s, 1m or 500ms after the start, or @NANOSECONDS"
         )
     unit = _UNIT_NS[(match["unit"] or ("ns" if match["at"] else "s")).lower()]
     span = int((Decimal(match["value"]) * unit).to_integral_value())

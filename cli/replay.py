@@ -133,14 +133,14 @@ def evaluate(
     path : Path
         A recording with estimates (marcha replay … -o).
     maximum : str
-        metric=limit that no run may exceed, for example rmse_deg=5; may be repeated. A miss gives exit code 4.
+        metric=limit that no run may exceed, such as rmse_deg=5; may be repeated. A miss gives exit code 4.
     minimum : str
         metric=limit that every run must reach; may be repeated.
     run : str
         Id of a run to measure; may be repeated. All without it.
     alignment : str
-        How a track is laid on the reference: as it is, first position, also first heading, least squares over turn
-        about the vertical and shift, or over all rotations and shift.
+        How a track is laid on the reference: as it is, first position, also first heading, least squares
+        over turn about the vertical and shift, or over all rotations and shift.
     reference : str
         Topic of the reference track, where several would fit.
     """

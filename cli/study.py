@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
 from .console import Heading, Outcome, progress
-from .options import DEFAULT, Common, Force, Output
+from .errors import DEFECTS, DONE
+from .options import DEFAULT, Common, Force, Output, Paths
 
 
 def study(
@@ -16,39 +16,53 @@ def study(
     /,
     *,
     output: Output,
-    data: Path | None = None,
+    data: Annotated[Paths, Parameter(name="--data")] = (),
+    workers: Annotated[int | None, Parameter(name="--workers")] = None,
     scheduler: str | None = None,
-    processes: Annotated[int | None, Parameter(name="--processes")] = None,
+    resume: bool = False,
     force: Force = False,
     common: Common = DEFAULT,
 ) -> Outcome:
     """Compare estimators over many recordings, with statistics.
+
+    Runs every recording through every estimator and parameter set. Finished
+    cells are kept: the same study given again goes on where it was. Exit code
+    3 says that some cells failed; the report names them.
 
     Parameters
     ----------
     config : str
         TOML file of the study, or the name of a preset (foot-tables).
     output : Path
-        Folder for results.parquet, results.csv, report.html and figures. Finished cells are not run again.
+        Folder for results.parquet, results.csv, report.html and figures/.
     data : Path
-        Folder of the recordings or raw logs, where the configuration leaves it open.
+        Folder or file of recordings or raw logs; may be repeated. The folder of the TOML file without it.
+    workers : int
+        Processes on this machine; one a core without it.
     scheduler : str
-        Address of a Dask scheduler; a process pool on this machine without it.
-    processes : int
-        Number of processes of the pool; one a core without it.
+        Address of a Dask scheduler that runs the study instead.
+    resume : bool
+        Go on in a folder that holds a study with another configuration, keeping the cells that both share.
     force : bool
-        Run finished cells again.
+        Start anew in a folder that holds a study.
     """
+    from ..ingest import convert
+    from ..ingest.simulate import simulate
     from ..replay.study import run_study
 
     with progress("study", common) as report:
         done = run_study(
             config,
             output,
-            data=data,
+            data=list(data) or None,
+            workers=workers,
             scheduler=scheduler,
-            processes=processes,
-            force=force,
+            convert=convert,
+            simulate=simulate,
+            overwrite=force,
+            resume=resume,
             progress=report,
         )
-    return Outcome(done.document, [Heading(line) for line in done.lines])
+    return Outcome(
+        done.document, [Heading(line) for line in done.lines], DEFECTS if done.cells_failed else DONE
+    )

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from .console import Heading, Outcome
+from .console import Heading, Outcome, complain
 from .options import DEFAULT, Common, Force
 
 
@@ -42,6 +42,6 @@ def view(
     if rrd is not None:
         viz.write_rrd(recs, rrd, overwrite=force)
     else:
-        viz.show(recs, web=web)
+        viz.show(recs, web=web, opened=lambda window: complain(f"the viewer is at {window.address}"))
     document = {"paths": [str(p) for p in paths], "rrd": str(rrd) if rrd else None, "web": web}
     return Outcome(document, [Heading(f"wrote {rrd}")] if rrd else [])

@@ -44,11 +44,11 @@ def to_events(annotations: pl.DataFrame, origin_ns: int) -> pl.DataFrame:
     Returns
     -------
     polars.DataFrame
-        Columns of :data:`COLUMNS`, by onset. The nanoseconds stay beside the seconds: nothing is rounded away.
+        Columns of :data:`COLUMNS`, by onset. Nanoseconds stay beside the seconds: nothing is rounded away.
     """
     return annotations.select(
-        onset=(pl.col("start_ns") - origin_ns) / 1e9,
-        duration=(pl.col("end_ns") - pl.col("start_ns")) / 1e9,
+        onset=((pl.col("start_ns") - origin_ns) / 1e9).round(9),
+        duration=((pl.col("end_ns") - pl.col("start_ns")) / 1e9).round(9),
         trial_type=pl.col("label"),
         tier="tier",
         start_ns="start_ns",
@@ -63,9 +63,10 @@ def read_events(path: Path, origin_ns: int, *, tier: str | None = None) -> pl.Da
     Parameters
     ----------
     path : Path
-        Tab- or comma-separated text with a header. Times are ``onset`` and ``duration`` in seconds since the start
-        of the recording, or ``start_ns`` and ``end_ns``, which win where both are there. The label is ``trial_type``
-        or ``label``; ``tier`` and ``metadata`` (JSON text) are optional. ``n/a`` is an empty cell.
+        Tab- or comma-separated text with a header. Times are ``onset`` and ``duration`` in seconds since the
+        start of the recording, or ``start_ns`` and ``end_ns``, which win where both are there. The label is
+        ``trial_type`` or ``label``; ``tier`` and ``metadata`` (JSON text) are optional. ``n/a`` is an empty
+        cell.
     origin_ns : int
         Time that onsets count from.
     tier : str, optional
@@ -79,7 +80,7 @@ def read_events(path: Path, origin_ns: int, *, tier: str | None = None) -> pl.Da
     Raises
     ------
     MarchaError
-        A missing file or column, a cell that is no number, an end before its start: file, line, value, remedy.
+        A missing column, a cell that is no number, an end before its start: file, line, value, remedy.
     """
     cells = _cells(path)
     names = set(cells.columns)
@@ -157,8 +158,8 @@ def _check(path: Path, table: pl.DataFrame) -> None:
     if backwards.len():
         row = int(backwards[0])
         raise MarchaError(
-            f"{path}: line {row + 2}: ends {table['end_ns'][row]} ns before it starts {table['start_ns'][row]} ns; "
-            "durations are not negative"
+            f"{path}: line {row + 2}: ends at {table['end_ns'][row]} ns, before it starts at "
+            f"{table['start_ns'][row]} ns; durations are not negative"
         )
     negative = (table["start_ns"] < 0).arg_true()
     if negative.len():

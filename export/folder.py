@@ -19,8 +19,8 @@ MARKER = "channels.json"
 def whole_folder(path: Path, *, overwrite: bool = False, marker: str = MARKER) -> Iterator[Path]:
     """Give a temporary folder beside ``path`` that takes its name when the block ends well.
 
-    The temporary folder is called ``.<name>.<process>.part``. An exception removes it; after a kill it stays, is
-    never mistaken for an export, and the next export to the same name removes it.
+    The temporary folder is called ``.<name>.<process>.part``. An exception removes it; after a kill it stays,
+    is never mistaken for an export, and the next export to the same name removes it.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def whole_folder(path: Path, *, overwrite: bool = False, marker: str = MARKER) -
     OutputExists
         ``path`` exists and ``overwrite`` is false.
     MarchaError
-        ``path`` is a file, or a folder of something else, or its parent does not exist.
+        ``path`` is a file, or a folder of something else, or its parent does not exist, or the disk is full.
     """
     path = Path(os.path.abspath(path))
     _may_be_created(path, overwrite, marker)
@@ -48,8 +48,11 @@ def whole_folder(path: Path, *, overwrite: bool = False, marker: str = MARKER) -
         for file in sorted(p for p in part.rglob("*") if p.is_file()):
             _flush(file)
         _put(part, path)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(part, ignore_errors=True)
+        if isinstance(error, OSError) and error.filename is None:  # a failed write does not know its file
+            reason = error.strerror or " ".join(str(error).split())
+            raise MarchaError(f"{path}: cannot write: {reason}; nothing was left there") from None
         raise
     if os.name == "posix":
         _flush(path.parent)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -10,10 +11,12 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from ..recording import Recording, create
+from ..recording import SCHEMAS, Recording, Writer, create
+from ..recording.errors import MarchaError
 from ..recording.selection import Selection, selected_topics, within
 from .events import ANNOTATIONS
 
+EVENT = "foxglove_msgs/msg/Event"
 STANCE = "marcha_msgs/msg/Stance"
 STEP = "marcha_msgs/msg/Step"
 ESTIMATE = "/estimate/"
@@ -44,25 +47,52 @@ class McapExporter:
     def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:
         """Write one file; see :class:`marcha.export.Exporter`."""
         topics = selected_topics(rec, options)
-        kept = [t for t in topics if options.estimates or not t.startswith(ESTIMATE)]
+        data = [t for t in topics if rec.channels[t].schema != EVENT]
+        kept = [t for t in data if options.estimates or not t.startswith(ESTIMATE)]
         with create(path, overwrite=overwrite) as out:
-            for topic in kept:
-                about = rec.channels[topic]
-                out.add_channel(topic, about.schema, about.frame_id, about.columns, about.metadata)
-            for window in rec.windows(kept, start_ns=options.start_ns, end_ns=options.end_ns):
-                for topic, table in window.tables.items():
-                    if table.height:
-                        out.add_table(topic, rec.channels[topic].schema, table)
-            for name, values in rec.metadata.items():
-                out.add_metadata(name, values)
-            out.add_metadata("export", provenance(rec, options))
-            for attachment in rec.attachments:
-                out.add_attachment(attachment.name, rec.attachment(attachment.name), attachment.media_type)
+            if options.whole:
+                tiers = [t for t, c in rec.channels.items() if options.annotations and c.schema == EVENT]
+                out.copy_from(rec, [*kept, *tiers])
+            else:
+                _copy_part(rec, kept, options, out)
             if options.annotations:
-                known = within(rec.annotations, options)
-                phases = [phases_of(rec, topic, options) for topic in topics]
-                out.add_annotations(pl.concat([known, *phases]).sort("start_ns", maintain_order=True))
+                phases = pl.concat(
+                    [pl.DataFrame(schema=ANNOTATIONS), *(phases_of(rec, t, options) for t in data)]
+                )
+                if phases.height:
+                    out.add_annotations(phases.sort("start_ns", maintain_order=True))
+            out.add_metadata(_free("export", rec.metadata), provenance(rec, options))
         return [path]
+
+
+def _copy_part(rec: Recording, topics: list[str], options: McapOptions, out: Writer) -> None:
+    """Copy a range of time, with all that speaks of the whole."""
+    for topic in topics:
+        about = rec.channels[topic]
+        if about.schema not in SCHEMAS:
+            raise MarchaError(
+                f"{rec.path}: {topic}: a part of a channel of type {about.schema} cannot be written; "
+                "leave out the range of time, or choose other topics"
+            )
+        out.add_channel(topic, about.schema, about.frame_id, about.columns, about.metadata)
+    for window in rec.windows(topics, start_ns=options.start_ns, end_ns=options.end_ns):
+        for topic, table in window.tables.items():
+            out.add_table(topic, rec.channels[topic].schema, table)
+    for name, values in rec.metadata.items():
+        out.add_metadata(name, values)
+    for attachment in rec.attachments:
+        out.add_attachment(attachment.name, rec.attachment(attachment.name), attachment.media_type)
+    known = within(rec.annotations, options)
+    if options.annotations and known.height:
+        out.add_annotations(known)
+
+
+def _free(name: str, taken: Container[str]) -> str:
+    number, free = 1, name
+    while free in taken:
+        number += 1
+        free = f"{name}_{number}"
+    return free
 
 
 def provenance(rec: Recording, options: McapOptions) -> dict[str, str]:
@@ -79,8 +109,8 @@ def provenance(rec: Recording, options: McapOptions) -> dict[str, str]:
 def phases_of(rec: Recording, topic: str, selection: Selection) -> pl.DataFrame:
     """Return stances or steps of an estimate as annotations, empty where the recording has them already.
 
-    Tiers are ``<run>/stance`` and ``<run>/step``, as a replay names them. A stance lasts from its first still sample
-    to the first moving one, or to the last sample.
+    Tiers are ``<run>/stance`` and ``<run>/step``, as a replay names them. A stance lasts from its first still
+    sample to the first moving one, or to the last sample.
     """
     channel = rec.channels[topic]
     run, _, _ = topic.removeprefix(ESTIMATE).rpartition("/")

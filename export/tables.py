@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,6 +17,7 @@ from .events import COLUMNS as EVENT_COLUMNS
 from .events import to_events
 from .folder import MARKER, whole_folder
 
+EVENT = "foxglove_msgs/msg/Event"
 EVENTS = "events.tsv"
 README = "README.txt"
 COMMON_COLUMNS = {
@@ -35,20 +37,19 @@ class TableExporter:
 
     @abstractmethod
     def write(self, stream: pl.LazyFrame, file: Path, about: dict[str, str]) -> None:
-        """Write ``stream`` to ``file`` with bounded memory; ``about`` are facts for formats that can hold them."""
+        """Write ``stream`` to ``file`` with bounded memory, and the facts ``about`` it where it can."""
 
     def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:
         """Write a folder; see :class:`marcha.export.Exporter`."""
-        topics = selected_topics(rec, options)
+        topics = [t for t in selected_topics(rec, options) if rec.channels[t].schema != EVENT]
         with whole_folder(path, overwrite=overwrite) as folder:
             names = _file_names(topics, self.file_suffix)
             entries = []
             for topic in topics:
                 channel = rec.channels[topic]
-                stream, rows = _stream(rec, channel, options)
                 about = {"topic": topic, "schema": channel.schema, "frame_id": channel.frame_id}
-                self.write(stream, folder / names[topic], about)
-                entries.append(_describe(channel, names[topic], rows()))
+                rows = self._write_channel(_Stream(rec, topic, options), folder / names[topic], about)
+                entries.append(_describe(channel, names[topic], rows))
             written = [names[topic] for topic in topics]
             events = _events(rec, options)
             if events.height:
@@ -72,12 +73,24 @@ class TableExporter:
             written += [*attached, MARKER, README]
         return [path / name for name in written]
 
+    def _write_channel(self, stream: _Stream, file: Path, about: dict[str, str]) -> int:
+        """Write one channel, return its rows; a full disk becomes an ``OSError``, whatever Polars says."""
+        try:
+            self.write(stream.frame, file, about)
+        except (OSError, pl.exceptions.ComputeError) as error:
+            if stream.failure is not None:
+                raise stream.failure from None
+            if isinstance(error, OSError) or "os error" in str(error):
+                raise OSError(" ".join(str(error).split())) from None
+            raise
+        return stream.rows
+
 
 class CsvExporter(TableExporter):
     """Comma-separated text, UTF-8, a header line, numbers with every digit that they have."""
 
     name = "csv"
-    title = "folder of CSV files, one a channel, with units in channels.json and events.tsv (spreadsheets, R, MATLAB)"
+    title = "folder of CSV files, one a channel, units in channels.json, events.tsv (spreadsheets, R, MATLAB)"
     file_suffix = ".csv"
 
     def write(self, stream: pl.LazyFrame, file: Path, about: dict[str, str]) -> None:
@@ -105,26 +118,48 @@ def _json_cell(value: Any) -> str:
     return msgspec.json.encode(plain).decode()
 
 
-def _stream(rec: Recording, channel: Channel, options: Selection) -> tuple[pl.LazyFrame, Any]:
-    """Return a channel as a lazy stream of its windows, and a function that tells how many rows have passed."""
-    from polars.io.plugins import register_io_source
+class _Stream:
+    """A channel as a lazy stream of its windows.
 
-    empty = rec.table(channel.topic, start_ns=0, end_ns=0, log_time=True)
-    passed = 0
+    Attributes
+    ----------
+    frame : polars.LazyFrame
+        The stream; can be read once.
+    rows : int
+        Rows that have passed.
+    failure : BaseException or None
+        Why the recording could not be read on: Polars would only say that something failed.
+    """
 
-    def source(
-        with_columns: list[str] | None, predicate: pl.Expr | None, n_rows: int | None, batch_size: int | None
+    def __init__(self, rec: Recording, topic: str, options: Selection) -> None:
+        from polars.io.plugins import register_io_source
+
+        self._tables = _tables(rec, topic, options)
+        first = next(self._tables, None)
+        if first is None:
+            first = rec.table(topic, start_ns=0, end_ns=0, log_time=True)
+        self._first = first
+        self.rows = 0
+        self.failure: BaseException | None = None
+        self.frame = register_io_source(self._source, schema=dict(first.schema))
+
+    def _source(
+        self, columns: list[str] | None, predicate: pl.Expr | None, n_rows: int | None, batch_size: int | None
     ) -> Iterator[pl.DataFrame]:
-        nonlocal passed
-        yield empty.select(with_columns or empty.columns)
-        for window in rec.windows([channel.topic], start_ns=options.start_ns, end_ns=options.end_ns):
-            table = window.tables.get(channel.topic)
-            if table is None or not table.height:
-                continue
-            passed += table.height
-            yield table.select(with_columns or empty.columns)
+        schema = self._first.schema
+        try:
+            for table in chain([self._first], self._tables):
+                self.rows += table.height
+                yield table.select(pl.col(name).cast(schema[name]) for name in columns or schema)
+        except Exception as error:
+            self.failure = error
+            raise
 
-    return register_io_source(source, schema=dict(empty.schema)), lambda: passed
+
+def _tables(rec: Recording, topic: str, options: Selection) -> Iterator[pl.DataFrame]:
+    for window in rec.windows([topic], start_ns=options.start_ns, end_ns=options.end_ns):
+        if topic in window.tables:
+            yield window.tables[topic]
 
 
 def _file_names(topics: list[str], suffix: str) -> dict[str, str]:
@@ -197,9 +232,9 @@ def _readme(rec: Recording, entries: list[dict[str, Any]], events: bool, attache
     lines = [
         f"Export of {rec.path.name}",
         "",
-        "One table a channel. t_ns is the time that a row speaks of, t_log_ns the time when it was known, both in",
-        "nanoseconds of the recording's clock. Vectors are in the frame that is named beside the channel; quaternions",
-        f"have their real part first. {MARKER} says the same for programs, with the recording's metadata.",
+        "One table a channel. t_ns is the time that a row speaks of, t_log_ns the time when it was known,",
+        "both in nanoseconds of the recording's clock. Vectors are in the frame that is named beside the channel;",
+        f"quaternions have their real part first. {MARKER} says the same for programs.",
     ]
     for entry in entries:
         frame = f", frame {entry['frame_id']}" if entry["frame_id"] else ""

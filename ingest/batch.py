@@ -12,9 +12,9 @@ from . import registry
 def logs(paths: Sequence[Path], *, format: str | None = None) -> tuple[list[Path], list[tuple[Path, str]]]:
     """Return every log that ``paths`` stand for, each to become one recording.
 
-    A file stands for itself, whatever is in it: what it is not good for is said when it is converted. A folder that
-    is one log as a whole (a phone's export) stands for itself, too; any other folder stands for every file in it and
-    below it whose content is recognised.
+    A file stands for itself, whatever is in it: what is wrong is said when it is converted. A folder
+    that is one log as a whole (a phone's export) stands for itself; any other folder stands for every file
+    in it and below it whose content is recognised.
 
     Parameters
     ----------
@@ -50,6 +50,8 @@ def logs(paths: Sequence[Path], *, format: str | None = None) -> tuple[list[Path
                 found.append(file)
             else:
                 skipped.append((file, f"not {format}" if format else "no known format"))
+    sides = {(log.parent, f"{log.stem}.truth") for log in found}  # they come along with their log
+    skipped = [(p, why) for p, why in skipped if (p.parent, p.name[: p.name.find(".truth") + 6]) not in sides]
     return list(dict.fromkeys(found)), skipped
 
 
