@@ -141,16 +141,19 @@ class Cells:
             block = b"\n".join(
                 block[a:b] for a, b in zip(starts[at].tolist(), ends[at].tolist(), strict=True)
             )
-        frame = pl.read_csv(
-            block,
-            has_header=False,
-            separator=self._separator.decode(),
-            infer_schema=False,
-            truncate_ragged_lines=True,
-            encoding="utf8-lossy",
-            new_columns=[f"c{i}" for i in range(self.width)],
-        )
-        if frame.height != at.size:  # a quote that is never closed swallows lines
+        try:
+            frame = pl.read_csv(
+                block,
+                has_header=False,
+                separator=self._separator.decode(),
+                infer_schema=False,
+                truncate_ragged_lines=True,
+                encoding="utf8-lossy",
+                new_columns=[f"c{i}" for i in range(self.width)],
+            )
+        except pl.exceptions.PolarsError:
+            frame = None
+        if frame is None or frame.height != at.size:  # a quote that is never closed swallows lines
             raise MarchaError(
                 f"{self.path}: lines {first_line} … {first_line + ends.size - 1}: a quote does not end "
                 "on its line; remove the quotes"

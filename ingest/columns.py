@@ -88,10 +88,15 @@ def float_blocks(path: Path, header: Header, report: ReportBuilder) -> Iterator[
     Raises
     ------
     MarchaError
-        The file ends with its header.
+        The file ends with its header, or its rows do not fit it.
     """
     cells = Cells(path, Layout(separator=header.separator, skip_rows=header.line - 1))
-    names = {f"c{i}": name for i, name in enumerate(cells.names) if name}
+    if tuple(cells.names) != header.names:
+        raise MarchaError(
+            f"{path}, line {header.line}: the header's {len(header.names)} names do not fit the "
+            f"{cells.width} cells of the first row; repair the header"
+        )
+    names = {f"c{i}": name for i, name in enumerate(header.names) if name}
     for block in cells.rows([int(c[1:]) for c in names], report):
         columns = {"line": block["line"]}
         for place, name in names.items():

@@ -43,7 +43,7 @@ class XioCsv:
 
     name: ClassVar[str] = "xio-csv"
     title: ClassVar[str] = "x-io CSV with a time column and units in its header (x-IMU3)"
-    Options = XioOptions
+    Options: ClassVar[type[CommonOptions]] = XioOptions
 
     def sniff(self, head: bytes, path: Path) -> float:
         """A header with x-io's column names and a time."""
