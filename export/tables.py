@@ -233,7 +233,7 @@ def _readme(rec: Recording, entries: list[dict[str, Any]], events: bool, attache
         f"Export of {rec.path.name}",
         "",
         "One table a channel. t_ns is the time that a row speaks of, t_log_ns the time when it was known,",
-        "both in nanoseconds of the recording's clock. Vectors are in the frame that is named beside the channel;",
+        "both in nanoseconds of the recording's clock. Vectors are in the frame named beside the channel;",
         f"quaternions have their real part first. {MARKER} says the same for programs.",
     ]
     for entry in entries:
