@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +46,7 @@ def check_plausible(
         if finite.size and not low <= (middle := float(np.median(finite))) <= high:
             report.note(
                 "unit_doubt",
-                f"{topic} {name}: the median is {middle:.4g} {unit}, expected {low:g} … {high:g}: right unit?",
+                f"{topic} {name}: the median is {middle:.4g} {unit}, not {low:g} … {high:g}: right unit?",
                 line=int(lines[0]),
                 subject=f"{topic} {name}",
             )
@@ -89,7 +90,7 @@ class SensorCheck:
         self._rest: float | None = None
         self._rest_line: int | None = None
 
-    def feed(self, values: Sequence[NDArray[np.generic]], lines: NDArray[np.int64]) -> None:
+    def feed(self, values: Sequence[NDArray[Any]], lines: NDArray[np.int64]) -> None:
         """Look at a block: one array an axis, in the order of ``columns``, and each row's line."""
         if not len(lines):
             return
@@ -99,7 +100,7 @@ class SensorCheck:
         self._rows += len(lines)
         self._clipping(values, lines)
         self._stuck(values, lines)
-        for i in np.flatnonzero(~self._moved):
+        for i in np.flatnonzero(~self._moved).tolist():
             self._moved[i] = bool(np.any(values[i] != self._first[i]))
 
     def feed_si(self, acc: Sequence[FloatArray], gyr: Sequence[FloatArray], lines: NDArray[np.int64]) -> None:
@@ -164,7 +165,7 @@ class SensorCheck:
                 subject=f"{self._subject} acc",
             )
 
-    def _clipping(self, values: Sequence[NDArray[np.generic]], lines: NDArray[np.int64]) -> None:
+    def _clipping(self, values: Sequence[NDArray[Any]], lines: NDArray[np.int64]) -> None:
         for name, v in zip(self._columns, values, strict=True):
             if name not in self._limits:
                 continue
@@ -180,7 +181,7 @@ class SensorCheck:
                 subject=f"{self._subject} {name}",
             )
 
-    def _stuck(self, values: Sequence[NDArray[np.generic]], lines: NDArray[np.int64]) -> None:
+    def _stuck(self, values: Sequence[NDArray[Any]], lines: NDArray[np.int64]) -> None:
         """Runs of at least STALE_ROWS equal readings of all axes, also across blocks."""
         n = len(lines)
         same = np.ones(n, dtype=bool)

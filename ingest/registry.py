@@ -334,6 +334,6 @@ def _type_text(kind: msgspec.inspect.Type) -> str:
     if isinstance(kind, msgspec.inspect.UnionType):
         return " or ".join(_type_text(t) for t in kind.types if not isinstance(t, msgspec.inspect.NoneType))
     if isinstance(kind, msgspec.inspect.LiteralType):
-        return ", ".join(str(v) for v in sorted(kind.values))
+        return ", ".join(str(v) for v in kind.values)
     words = {"StrType": "text", "IntType": "integer", "FloatType": "number", "BoolType": "true or false"}
     return words.get(type(kind).__name__, type(kind).__name__.removesuffix("Type").lower())

@@ -220,7 +220,7 @@ def scan(data, low, high, first_line, values, lines, wall, odd):
                     separators += 1
                 if data[k] < 32 and data[k] != 9:
                     words = False
-            if words and separators < columns // 2:
+            if words and separators < 2:
                 status = CHATTER
         elif status == ROW and column < columns:
             status = FEW
