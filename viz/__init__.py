@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from .figure import write_figure
+from .figures import figure, save_figure
 from .live import LiveSink, show
 from .rrd import RrdExporter, write_rrd
 
-__all__ = ["LiveSink", "RrdExporter", "show", "write_figure", "write_rrd"]
+__all__ = ["LiveSink", "RrdExporter", "figure", "save_figure", "show", "write_rrd"]

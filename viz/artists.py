@@ -13,6 +13,9 @@ from . import style
 from .scene import ChannelLike, Floats, Scene, Threshold, Times, columns_of, is_estimate, thresholds_of
 from .track import Track
 
+CLOSED_M = 1.0
+"""Start and end closer than this have one label."""
+
 FAR_ABOVE = 10.0
 """A statistic that rises more than so many times above its threshold is shown up to there: else the threshold is at zero."""
 
@@ -178,11 +181,12 @@ class Pose(Artist):
         # names stand at different places of the walk, so that those of several runs do not cover each other
         at = len(line) * (owners.index(self.base) + 1) // (len(owners) + 1)
         first = owners[0] == self.base
+        closed = float(np.linalg.norm(line[-1] - line[0])) < CLOSED_M
         self.scene.static(
             f"{self.base}/mark",
             rr.Points3D(
                 line[[0, at, -1]],
-                labels=["start" if first else "", self.owner, "end" if first else ""],
+                labels=["start" if first else "", self.owner, "end" if first and not closed else ""],
                 colors=color,
                 radii=rr.Radius.ui_points([5.0, 0.0, 5.0]),
                 show_labels=True,

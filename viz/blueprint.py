@@ -12,19 +12,13 @@ import numpy as np
 import rerun.blueprint as rrb
 
 from .scene import TIMELINE, Entry, Floats, Scene
-from .track import Track
+from .track import STANDING_M, Track, framed
 
 TRAIL_S = 60.0
 """Length of the trail behind the cursor where a recording is too long to show all of it."""
 
 TRAIL_ROWS = 60_000
 """Up to this many samples the trail reaches back to the start."""
-
-RUN_AWAY = 3.0
-"""A track so many times larger than the smallest one has run away."""
-
-STANDING_M = 0.5
-"""A track smaller than this has not walked."""
 
 SPATIAL = ("track", "trail", "foot", "mark", "footprints")
 BACKGROUND = (24, 28, 34)
@@ -104,11 +98,11 @@ def _space(
     centre, size = (low + high) / 2, max(float(np.linalg.norm((high - low)[:2])), 2.0)
     if above:
         eye = rrb.EyeControls3D(
-            position=centre + (0.0, -1e-3 * size, 1.25 * size), look_target=centre, eye_up=(0.0, 1.0, 0.0)
+            position=centre + (0.0, -1e-3 * size, 1.1 * size), look_target=centre, eye_up=(0.0, 1.0, 0.0)
         )
     else:
         eye = rrb.EyeControls3D(
-            position=centre + (-0.15 * size, -0.95 * size, 0.75 * size), look_target=centre, eye_up=(0.0, 0.0, 1.0)
+            position=centre + (-0.12 * size, -0.78 * size, 0.62 * size), look_target=centre, eye_up=(0.0, 0.0, 1.0)
         )
     whole = all(t.seen <= TRAIL_ROWS for s in scenes for t in s.tracks.values())
     boundary = rrb.TimeRangeBoundary
@@ -134,14 +128,10 @@ def _space(
 
 
 def _framed(scenes: Sequence[Scene]) -> tuple[list[Track], bool]:
-    """Return the tracks that a view should be zoomed to, and whether those are all.
-
-    One that has run away (an uncorrected mechanization falls through the floor) must not hide the others.
-    """
+    """Return the tracks that a view should be zoomed to, and whether those are all."""
     tracks = [t for s in scenes for t in s.tracks.values() if t.count]
-    walked = [t.size_m for t in tracks if t.size_m > STANDING_M]
-    framed = [t for t in tracks if t.size_m <= RUN_AWAY * min(walked)] if walked else tracks
-    return framed, len(framed) == len(tracks)
+    chosen = framed(tracks)
+    return chosen, len(chosen) == len(tracks)
 
 
 def _extent(scenes: Sequence[Scene]) -> tuple[Floats, Floats]:

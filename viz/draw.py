@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import polars as pl
 import rerun as rr
 
 from ..recording import Recording
 from ..recording.atomic import AtomicFile
 from ..recording.errors import MarchaError
+from ..recording.selection import Selection, selected_topics, within
 from .blueprint import blueprint
 from .report import report
 from .scene import Clock, Scene
@@ -54,10 +54,7 @@ def clock_from(t_ns: int, said: str = "") -> Clock:
 def draw(
     recs: Sequence[Recording],
     stream: rr.RecordingStream,
-    *,
-    topics: Sequence[Sequence[str]] | None = None,
-    start_ns: int | None = None,
-    end_ns: int | None = None,
+    selection: Selection | None = None,
 ) -> list[Scene]:
     """Log recordings, their reports and the blueprint into a stream that has its sinks.
 
@@ -67,28 +64,27 @@ def draw(
         One, or several to be shown together.
     stream : rerun.RecordingStream
         Where to log.
-    topics : sequence of sequence of str, optional
-        Topics of each recording; all by default.
-    start_ns, end_ns : int, optional
-        Range of log times, half open.
+    selection : Selection, optional
+        Topics and range of log times; everything by default.
 
     Returns
     -------
     list of Scene
         One a recording.
     """
+    selection = selection or Selection()
+    topics = [selected_topics(rec, selection) for rec in recs]
     stream.send_recording_name(", ".join(rec.path.stem for rec in recs))
     prefixes = [""] if len(recs) == 1 else prefixes_of(recs)
     scenes: list[Scene] = []
-    for i, (rec, clock, prefix) in enumerate(zip(recs, clock_of(recs), prefixes, strict=True)):
-        chosen = list(topics[i]) if topics is not None else list(rec.channels)
+    for rec, chosen, clock, prefix in zip(recs, topics, clock_of(recs), prefixes, strict=True):
         channels = [rec.channels[t] for t in chosen]
         scene = Scene(stream, channels, clock, prefix, first_color=sum(len(s.runs) or 1 for s in scenes))
         scene.begin()
-        for window in rec.windows(chosen, start_ns=start_ns, end_ns=end_ns):
+        for window in rec.windows(chosen, start_ns=selection.start_ns, end_ns=selection.end_ns):
             for topic, table in window.tables.items():
                 scene.write(topic, table)
-        scene.annotate(_within(rec.annotations, start_ns, end_ns))
+        scene.annotate(within(rec.annotations, selection))
         scene.end()
         text = rr.TextDocument(report(rec), media_type=rr.MediaType.MARKDOWN)
         scene.static(f"{scene.prefix}/report", text)
@@ -119,11 +115,3 @@ def prefixes_of(recs: Sequence[Recording]) -> list[str]:
     """Return one entity prefix a recording: its file's name, numbered where two are alike."""
     names = [rec.path.stem for rec in recs]
     return [f"/{n}" if names.count(n) == 1 else f"/{n}-{names[: i + 1].count(n)}" for i, n in enumerate(names)]
-
-
-def _within(annotations: pl.DataFrame, start_ns: int | None, end_ns: int | None) -> pl.DataFrame:
-    if start_ns is not None:
-        annotations = annotations.filter(pl.col("end_ns") >= start_ns)
-    if end_ns is not None:
-        annotations = annotations.filter(pl.col("start_ns") < end_ns)
-    return annotations

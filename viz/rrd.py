@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import msgspec
 
-from ..recording.selection import Selection, selected_topics
+from ..recording.selection import Selection
 from ..recording import Recording
 from ..recording.atomic import AtomicFile
 
@@ -48,8 +48,6 @@ def write_rrd(
         A recording cannot be read, or the file not written.
     """
     recs = [recs] if isinstance(recs, Recording) else list(recs)
-    selection = selection or Selection()
-    topics = [selected_topics(rec, selection) for rec in recs]
     file = AtomicFile(Path(path), overwrite=overwrite)
     try:
         import rerun as rr
@@ -58,7 +56,7 @@ def write_rrd(
 
         stream = new_stream()
         stream.set_sinks(rr.FileSink(file.part))
-        draw(recs, stream, topics=topics, start_ns=selection.start_ns, end_ns=selection.end_ns)
+        draw(recs, stream, selection)
         stream.flush()
         stream.disconnect()
         check_whole(file)

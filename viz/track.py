@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,12 @@ Times = NDArray[np.int64]
 
 LIMIT = 65536
 """Points kept of a track; beyond it every second one goes, so memory stays bounded at any length."""
+
+RUN_AWAY = 3.0
+"""A track so many times larger than the smallest one has run away."""
+
+STANDING_M = 0.5
+"""A track smaller than this has not walked."""
 
 
 class Track:
@@ -84,6 +91,15 @@ class Track:
     def positions(self) -> Floats:
         """Positions (n, 3), m."""
         return np.concatenate(self._p) if self._p else np.empty((0, 3))
+
+
+def framed(tracks: Sequence[Track]) -> list[Track]:
+    """Return the tracks that a view should be zoomed to.
+
+    One that has run away (an uncorrected mechanization falls through the floor) must not hide the others.
+    """
+    walked = [t.size_m for t in tracks if t.size_m > STANDING_M]
+    return [t for t in tracks if t.size_m <= RUN_AWAY * min(walked)] if walked else list(tracks)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,308 @@
+"""Figures of a recording for papers and pages: PNG and SVG, the same bytes for the same recording.
+
+Matplotlib's object interface is used throughout; its global state (pyplot, rcParams) stays as the caller has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..recording import Recording
+from ..recording.atomic import AtomicFile
+from ..recording.errors import UsageError
+from . import style
+from .track import Compared, Track, compare, framed
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+ALIGNMENT = "origin-yaw"
+POINTS = 20_000
+"""Most points of a line: more than any printer resolves."""
+
+GRID = {"color": "#DDDDDD", "linewidth": 0.6}
+POSE = "geometry_msgs/msg/PoseStamped"
+
+
+def figure(recs: Recording | Sequence[Recording], *, alignment: str = ALIGNMENT) -> Figure:
+    """Return the figure of a recording: tracks, height, stances under the accelerometer's norm, errors.
+
+    Parameters
+    ----------
+    recs : Recording or sequence of Recording
+        With estimates, or raw (then only the signals are drawn). Several get one row each: tracks, height, errors.
+    alignment : str
+        How tracks are laid upon the reference; see :func:`marcha.replay.alignment.align`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        With the Agg canvas; save it with :func:`save_figure` for reproducible bytes.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    scenes = [_scene(rec, alignment) for rec in ([recs] if isinstance(recs, Recording) else recs)]
+    if len(scenes) == 1:
+        size = (12.0, 7.0 if scenes[0].tracks else 4.0)
+    else:
+        size = (13.0, 4.0 * len(scenes))
+    fig = Figure(figsize=size, dpi=120, layout="constrained", facecolor="white")
+    FigureCanvasAgg(fig)
+    if len(scenes) == 1:
+        _one(fig, scenes[0])
+        return fig
+    for row, scene in zip(np.atleast_1d(fig.subfigures(len(scenes), 1)), scenes, strict=True):
+        row.suptitle(scene.rec.path.stem, fontsize=11, fontweight="bold")
+        plan, *others = row.subplots(1, 3 if scene.with_errors else 2)
+        _plan(plan, scene, legend=False)
+        for ax, draw in zip(others, (_heights, _errors), strict=False):
+            _time(ax, draw, scene)
+            ax.set_xlabel("time since the start (s)", fontsize=9)
+    handles = {}
+    for scene in scenes:
+        for track in scene.shown:
+            handles.setdefault(track.owner, _key(track, scene))
+    fig.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize=8)
+    return fig
+
+
+def save_figure(
+    recs: Recording | Sequence[Recording],
+    path: Path | str,
+    *,
+    overwrite: bool = False,
+    alignment: str = ALIGNMENT,
+) -> Path:
+    """Write the figure of one or several recordings as PNG or SVG, by the suffix.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    UsageError
+        Another suffix.
+    OutputExists
+        The file exists and ``overwrite`` is false.
+    """
+    import matplotlib
+
+    path = Path(path)
+    kind = path.suffix.lower().lstrip(".")
+    if kind not in ("png", "svg"):
+        raise UsageError(f"{path}: figures are .png or .svg, not {path.suffix or 'without suffix'}")
+    file = AtomicFile(path, overwrite=overwrite)
+    try:
+        # neither dates nor versions nor random ids: the same recording gives the same bytes
+        metadata = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
+        with matplotlib.rc_context({"svg.hashsalt": "marcha", "svg.fonttype": "path"}):
+            figure(recs, alignment=alignment).savefig(file.part, format=kind, metadata=metadata)
+    except BaseException:
+        file.abort()
+        raise
+    file.commit()
+    return path
+
+
+# -- what is drawn ---------------------------------------------------------------------------------
+
+
+@dataclass
+class _Scene:
+    """A recording and what its figure needs of it."""
+
+    rec: Recording
+    tracks: dict[str, Track]
+    reference: Track | None
+    compared: dict[str, Compared]
+    alignment: str
+
+    @property
+    def zero_ns(self) -> int:
+        return self.rec.start_ns or 0
+
+    @property
+    def shown(self) -> list[Track]:
+        return [*([self.reference] if self.reference is not None else []), *self.tracks.values()]
+
+    @property
+    def with_errors(self) -> bool:
+        return bool(self.compared) or any(_topic(t, "sigma") in self.rec.channels for t in self.tracks)
+
+    def seconds(self, t_ns: NDArray[np.int64]) -> Floats:
+        return (t_ns - self.zero_ns) / 1e9
+
+
+def _topic(run: str, what: str) -> str:
+    return f"/estimate/{run}/{what}"
+
+
+def _scene(rec: Recording, alignment: str) -> _Scene:
+    """Read every run's track, in the order of the recording, and the reference's, and compare them."""
+    poses = [t for t, c in rec.channels.items() if c.schema == POSE]
+    runs = [t for t in poses if t.startswith("/estimate/") and t.endswith("/pose")]
+    references = [t for t in poses if t.startswith("/reference/")]
+    chosen = "/reference/pose" if "/reference/pose" in references else references[0] if references else None
+    found = {t: Track(t.split("/")[2], style.run_color(i)) for i, t in enumerate(runs)}
+    if chosen is not None:
+        found[chosen] = Track("reference", style.REFERENCE)
+    for window in rec.windows(list(found)) if found else ():
+        for topic, table in window.tables.items():
+            found[topic].add(table["t_ns"].to_numpy(), table.select("pos_x", "pos_y", "pos_z").to_numpy())
+    tracks = {t.split("/")[2]: found[t] for t in runs if found[t].count}
+    reference = found[chosen] if chosen is not None and found[chosen].count else None
+    compared: dict[str, Compared] = {}
+    for run, track in tracks.items():
+        result = compare(track, reference, alignment) if reference is not None else None
+        if result is not None:
+            track.place, compared[run] = result.place, result
+    return _Scene(rec, tracks, reference, compared, alignment)
+
+
+def _one(fig: Figure, scene: _Scene) -> None:
+    """Lay out the figure of one recording: the plan on the left, everything over time on the right."""
+    fig.suptitle(scene.rec.path.stem, fontsize=12, fontweight="bold")
+    signals: Any = fig
+    panels = [_signals]
+    if scene.shown:
+        left, signals = fig.subfigures(1, 2, width_ratios=[1.0, 1.1])
+        _plan(left.subplots(), scene)
+        panels = [_heights, _signals, *([_errors] if scene.with_errors else [])]
+    axes = signals.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    for draw, ax in zip(panels, axes, strict=True):
+        _time(ax, draw, scene)
+    axes[-1].set_xlabel("time since the start of the recording (s)", fontsize=9)
+
+
+def _time(ax: Axes, draw: Callable[[Axes, _Scene], None], scene: _Scene) -> None:
+    draw(ax, scene)
+    ax.grid(**GRID)
+    ax.set_axisbelow(True)
+
+
+def _thin(*columns: NDArray[Any]) -> list[NDArray[Any]]:
+    stride = max(1, len(columns[0]) // POINTS)
+    return [c[::stride] for c in columns]
+
+
+def _label(ax: Axes, title: str, y: str) -> None:
+    ax.set_title(title, fontsize=10, loc="left")
+    ax.set_ylabel(y, fontsize=9)
+    ax.tick_params(labelsize=8)
+
+
+def _line(track: Track, scene: _Scene) -> dict[str, Any]:
+    """Return how a track's line looks: the reference lies wide and pale under the runs."""
+    wide = track is scene.reference
+    return {"color": track.color, "linewidth": 3.0 if wide else 1.4, "alpha": 0.6 if wide else 1.0}
+
+
+def _key(track: Track, scene: _Scene) -> Any:
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], **_line(track, scene))
+
+
+def _plan(ax: Axes, scene: _Scene, *, legend: bool = True) -> None:
+    """Draw all tracks from above, with equal axes, start and end marked."""
+    for track in scene.shown:
+        x, y = _thin(*track.shown[:, :2].T)
+        ax.plot(x, y, **_line(track, scene), label=track.owner)
+        ax.plot(x[-1], y[-1], "s", color=track.color, markersize=6, markeredgecolor="white", zorder=4)
+    start = scene.shown[0].shown[0]
+    ax.plot(start[0], start[1], "o", color="black", markersize=11, fillstyle="none", zorder=5, label="start")
+    ax.plot([], [], "s", color="#666666", label="end")
+    inside = np.concatenate([t.shown[:, :2] for t in framed(scene.shown)])
+    low, high = inside.min(axis=0), inside.max(axis=0)
+    margin = 0.08 * max(float(np.max(high - low)), 1.0)
+    ax.set_xlim(low[0] - margin, high[0] + margin)
+    ax.set_ylim(low[1] - margin, high[1] + margin)
+    ax.set_aspect("equal", adjustable="box")
+    ax.grid(**GRID)
+    ax.set_axisbelow(True)
+    _label(ax, f"from above{f' (alignment {scene.alignment})' if scene.compared else ''}", "y (m)")
+    ax.set_xlabel("x (m)", fontsize=9)
+    if legend:
+        ax.legend(fontsize=8, framealpha=0.9, loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=2)
+
+
+def _heights(ax: Axes, scene: _Scene) -> None:
+    for track in scene.shown:
+        t, z = _thin(scene.seconds(track.t_ns), track.positions[:, 2])
+        ax.plot(t, z, color=track.color, linewidth=1.0)
+    z = np.concatenate([t.positions[:, 2] for t in framed(scene.shown)])
+    margin = 0.1 * (float(np.ptp(z)) + 0.1)
+    ax.set_ylim(float(z.min()) - margin, float(z.max()) + margin)
+    _label(ax, "height", "z (m)")
+
+
+def _signals(ax: Axes, scene: _Scene) -> None:
+    """Draw the accelerometer's norm, and under it one lane of stances for each run and the reference."""
+    rec, runs = scene.rec, list(scene.tracks)
+    imus = [t for t, c in rec.channels.items() if "acc_x" in c.columns]
+    read = [t for t in imus if any(t.strip("/").replace("/", "_") in run for run in runs)]
+    drawn, high = (read or imus)[: 1 if runs else None], 0.0
+    for i, topic in enumerate(drawn):
+        table = rec.table(topic)
+        acc = table.select("acc_x", "acc_y", "acc_z").to_numpy()
+        t, norm = _thin(scene.seconds(table["t_ns"].to_numpy()), np.linalg.norm(acc, axis=1))
+        ax.plot(t, norm, color=style.NORM if runs else style.run_color(i), linewidth=0.8, label=topic)
+        high = max(high, float(np.nanmax(norm, initial=0.0)))
+    lanes = [("/reference/stance", style.REFERENCE)]
+    lanes += [(_topic(run, "stance"), style.run_color(i)) for i, run in enumerate(runs)]
+    lanes = [(topic, color) for topic, color in lanes if topic in rec.channels]
+    height = 0.09 * max(high, 1.0)
+    for k, (topic, color) in enumerate(lanes):
+        bars = _stances(scene, topic)
+        ax.broken_barh(bars, (-(k + 1.2) * height, 0.8 * height), facecolors=color, linewidth=0)
+    title = f"norm of the accelerometer{f' of {drawn[0]}' if len(drawn) == 1 else ''}"
+    _label(ax, title + (", and stances (bars: foot still)" if lanes else ""), "‖acc‖ (m/s²)")
+    if lanes:
+        ax.set_ylim(-(len(lanes) + 0.6) * height, 1.05 * max(high, 1.0))
+        ax.set_yticks([v for v in ax.get_yticks() if 0.0 <= v <= high])
+    if len(drawn) > 1:
+        ax.legend(fontsize=8, framealpha=0.9, loc="upper right")
+
+
+def _stances(scene: _Scene, topic: str) -> list[tuple[float, float]]:
+    """Return the stances of a channel as (start, duration), s."""
+    table = scene.rec.table(topic)
+    still = table["still"].cast(bool).to_numpy().astype(np.int8)
+    edges = np.diff(still, prepend=np.int8(0), append=np.int8(0))
+    t = scene.seconds(table["t_ns"].to_numpy())
+    first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+    return [(float(t[a]), float(t[b] - t[a])) for a, b in zip(first, last, strict=True)]
+
+
+def _errors(ax: Axes, scene: _Scene) -> None:
+    """Draw every run's distance to the reference as a line, and its filter's own sigma as an area."""
+    inside, top = framed(scene.shown), 0.0
+    for run, track in scene.tracks.items():
+        if run in scene.compared:
+            found = scene.compared[run]
+            distance = np.linalg.norm(found.error, axis=1)
+            t, d = _thin(scene.seconds(found.t_ns), distance)
+            ax.plot(t, d, color=track.color, linewidth=1.2)
+            top = max(top, float(distance.max())) if track in inside else top
+        topic = _topic(run, "sigma")
+        if topic in scene.rec.channels:
+            table = scene.rec.table(topic)
+            sigma = np.sqrt(np.sum(table.select(r"^sigma_pos_[xyz]$").to_numpy() ** 2, axis=1))
+            t, s = _thin(scene.seconds(table["t_ns"].to_numpy()), sigma)
+            ax.fill_between(t, 0.0, s, color=track.color, alpha=0.2, linewidth=0)
+            top = max(top, float(np.nanmax(sigma, initial=0.0))) if track in inside else top
+    ax.set_ylim(0.0, 1.1 * top if top > 0.0 else 1.0)
+    title = "distance to the reference (area: the filter's own 1σ)"
+    _label(ax, title if scene.compared else "the filter's own 1σ of the position", "distance (m)")
