@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import warnings
 from collections.abc import Callable
@@ -80,8 +81,10 @@ def build_params(name: str, cls: type[PlainEstimator], params: dict[str, Any]) -
         raise AlgorithmError(f"{name} has no parameter {unknown[0]!r}; it has: {_names(fields) or 'none'}")
     for key, value in params.items():
         try:
-            msgspec.convert({key: value}, cls.Params, strict=False)
-        except msgspec.ValidationError as error:
+            taken = getattr(msgspec.convert({key: value}, cls.Params, strict=False), key)
+            if isinstance(taken, float) and not math.isfinite(taken):
+                raise ValueError("not finite")
+        except (msgspec.ValidationError, ValueError) as error:
             field = fields[key]
             allowed = ", ".join(field.choices) or f"{field.type} {field.range}".strip()
             unit = f" ({field.unit})" if field.unit not in ("", "1") else ""
