@@ -7,11 +7,13 @@ import struct
 import tomllib
 from pathlib import Path
 
+import marcha.recording as mr
 import numpy as np
 import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from marcha.ingest import convert
 from marcha.ingest import simulate as sim
 from marcha.ingest.simulate.gait import BALL, HEEL
 from marcha.ingest.simulate.walks import BLOCK, make_options
@@ -421,3 +423,34 @@ def test_any_walk_stands_on_its_footfalls(
     feet = w.simulation.route.footfalls[:, :3]
     nearest = np.min(np.linalg.norm(rests[:, None] - feet[None], axis=2), axis=1)
     assert nearest.max() < 1e-9
+
+
+def test_the_importer_gives_back_what_was_written_and_the_truth(tmp_path: Path) -> None:
+    defects = {"boot_chatter": True, "wall_clock": True, "drop_share": 0.02, "duplicate_share": 0.02}
+    done = sim.simulate("stairs", tmp_path, seed=9, config="1332", start_ms=2**32 - 9000, **defects)
+    convert(done.paths, tmp_path / "w.mcap")
+    rec = mr.open(tmp_path / "w.mcap")
+    for sensor, reference in ((1, "/reference/pose"), (2, "/reference/imu2/pose")):
+        w = sim.walk("stairs", seed=9, config="1332", start_ms=2**32 - 9000, sensor=sensor)  # type: ignore[arg-type]
+        imu = rec.table(f"/foot/imu{sensor}")
+        at = np.searchsorted(w.t_ns, imu["t_ns"].to_numpy())
+        np.testing.assert_array_equal(w.t_ns[at], imu["t_ns"])
+        assert (np.diff(at) > 0).all()
+        assert 0.96 < len(at) / len(w.t) < 0.995
+        read = imu.select("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z").to_numpy()
+        np.testing.assert_allclose(read, np.hstack(w.measured())[at], rtol=1e-12, atol=1e-12)
+        pose = rec.table(reference)
+        np.testing.assert_array_equal(pose["t_ns"], w.t_ns)
+        np.testing.assert_allclose(pose.drop("t_ns"), np.hstack((w.pos, w.quat_wxyz)), atol=1e-12)
+    assert rec.metadata["truth"]["closed"] == "true"
+    assert float(rec.metadata["truth"]["length_m"]) == pytest.approx(done.length_m, abs=1e-6)
+
+
+def test_packets_and_text_become_the_same_recording(tmp_path: Path) -> None:
+    tables = []
+    for kind in ("text", "packets"):
+        done = sim.simulate("straight", tmp_path / kind, format=kind)
+        convert(done.paths, tmp_path / f"{kind}.mcap")
+        rec = mr.open(tmp_path / f"{kind}.mcap")
+        tables.append([rec.table(f"/foot/imu{k}").select("t_ns", "acc_x", "gyr_z") for k in (1, 2)])
+    assert all(a.equals(b) for a, b in zip(*tables, strict=True))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
@@ -16,6 +16,8 @@ from ...recording.errors import UsageError
 from .gait import FloatArray, Gait, Motion, Mount, Style
 from .scenarios import SCENARIOS, Route, route
 from .sensors import IDEAL, MPU6050_1, MPU6050_2, STANDARD_GRAVITY, Imu, ImuErrors
+
+T = TypeVar("T", bound=msgspec.Struct)
 
 BLOCK = 1 << 16
 """Samples that are made at a time: bounds memory."""
@@ -149,18 +151,39 @@ def make_options(scenario: str, given: dict[str, Any]) -> Options:
                 parts[imu].setdefault(name, value)
         else:
             flat[name] = value
-    try:
-        options = msgspec.convert(flat, Options, strict=False)
-        changed: dict[str, Any] = {}
-        for name, values in parts.items():
-            if values:
-                old = options.imu(int(name[-1])) if name.startswith("imu") else getattr(options, name)
-                changed[name] = msgspec.convert(msgspec.to_builtins(old) | values, type(old), strict=False)
-    except msgspec.ValidationError as error:
-        raise UsageError(f"simulate {scenario}: {error}") from error
+    options = checked(scenario, Options, flat)
+    changed: dict[str, Any] = {}
+    for name, values in parts.items():
+        if values:
+            old = options.imu(int(name[-1])) if name.startswith("imu") else getattr(options, name)
+            changed[name] = checked(scenario, type(old), msgspec.to_builtins(old) | values, f"{name}.")
     if options.laps is not None and options.duration_s is not None:
         raise UsageError(f"simulate {scenario}: laps and duration_s exclude each other: give one of them")
     return msgspec.structs.replace(options, **changed)
+
+
+def checked(scenario: str, kind: type[T], values: dict[str, Any], prefix: str = "") -> T:
+    """Return ``values`` as a structure; text is converted.
+
+    Raises
+    ------
+    UsageError
+        A field is unknown, or a value breaks its rule.
+    """
+    known = [f.name for f in msgspec.structs.fields(kind)]
+    for name in values:
+        if name not in known:
+            more = "" if prefix else ", and the fields of style and errors (docs/formats.md)"
+            raise UsageError(
+                f"simulate {scenario}: unknown option {prefix + name!r}; there are {', '.join(known)}{more}"
+            )
+    try:
+        return msgspec.convert(values, kind, strict=False)
+    except msgspec.ValidationError as error:
+        said, _, path = str(error).partition(" - at `$.")
+        name = path.rstrip("`")
+        value = values.get(name.split("[")[0], "")
+        raise UsageError(f"simulate {scenario}: option {prefix}{name}={value!r}: {said}") from None
 
 
 def _plain(value: Any) -> Any:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ...recording.errors import MarchaError, OutputExists, UsageError
 from .gait import Motion
-from .walks import Simulation, make_options
+from .walks import Simulation, checked, make_options
 
 CHATTER = (
     "Initializing I2C...",
@@ -140,12 +140,9 @@ def simulate(
     if format not in ("text", "packets"):
         raise UsageError(f"simulate: format {format!r} is unknown: choose text or packets")
     line_given = {k: options.pop(k) for k in Line.__struct_fields__ if k in options}
-    try:
-        line = msgspec.convert(line_given, Line, strict=False)
-    except msgspec.ValidationError as error:
-        raise UsageError(f"simulate {scenario}: {error}") from error
+    line = checked(scenario, Line, line_given)
     if format == "packets" and line != Line():
-        raise UsageError(f"simulate {scenario}: {', '.join(line_given)}: only text has these; leave them out")
+        raise UsageError(f"simulate {scenario}: only text has {', '.join(line_given)}; leave them out")
     simulation = Simulation(scenario, seed, make_options(scenario, options))
     stem = f"conf-{simulation.options.config}-{name or f'{scenario}-{seed:03d}'}"
     folder = Path(out_dir)
