@@ -10,6 +10,7 @@ import hashlib
 import inspect
 import random
 import sys
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -281,3 +282,10 @@ def tasks(
     # The cheapest first (it warms the caches), then the largest, so that no long task is left for the end.
     result.sort(key=lambda t: (-t.source.size, t.source.name))
     return result[-1:] + result[:-1]
+
+
+def preparations(todo: Sequence[Task]) -> list[Task]:
+    """Return a task without jobs for every recording that several tasks share: it is made once, before them."""
+    counts = Counter(task.source.name for task in todo)
+    shared = {task.source.name: task for task in todo if counts[task.source.name] > 1}
+    return [msgspec.structs.replace(task, jobs=[]) for task in shared.values()]

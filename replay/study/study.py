@@ -21,7 +21,6 @@ from . import analysis, plan
 from . import config as cfg
 from .cells import Cell, Makers, cached, failed, run_task
 from .executors import Executor
-from .figures import draw
 from .report import Material, Picture, render
 from .store import CellStore, tidy, write_atomic
 
@@ -176,7 +175,10 @@ def run_study(
         total, done = len(wanted), len(wanted) - sum(len(t.jobs) for t in todo)
         if progress:
             progress(done, total)
-        for task, outcome in executor.run(partial(run_task, Makers(convert, simulate)), todo):
+        function = partial(run_task, Makers(convert, simulate))
+        for _ in executor.run(function, plan.preparations(todo)):
+            pass  # what cannot be prepared fails again, and is recorded, in its own tasks
+        for task, outcome in executor.run(function, todo):
             cells = failed(task, outcome) if isinstance(outcome, Exception) else outcome
             store.add(task.name, cells)
             for job in task.jobs:
@@ -189,6 +191,8 @@ def run_study(
         analysed = _analyse(
             config, toml, cells, notes, code, started, scheduler or f"{executor.processes} processes"
         )
+        from .figures import draw  # matplotlib takes half a second: not for importing this room
+
         pictures = draw(executor, analysed, cells, config)
     files = _write(folder, analysed, pictures)
     return StudyResult(
