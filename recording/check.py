@@ -45,7 +45,7 @@ def check(rec: Recording) -> list[Finding]:
     list of Finding
         First what was lost in reading it, then what the structure shows (:mod:`~.integrity`), then by
         channel ``empty_channel``, ``backwards_time``, ``duplicate_time``, ``gap``, ``missing_cell`` and
-        ``all_zero``. ``first_line`` is the row of the channel, from 1. Estimates are only asked whether they are empty:
+        ``all_zero``. ``first_line`` is the row of the channel, from 1. Estimates are only asked if empty:
         their missing values are the estimator's to explain.
     """
     found = structure(rec)

@@ -180,6 +180,10 @@ class Encoder:
         self._cache[texts] = dtype, record
         return dtype, record
 
+    def blank(self) -> bytes:
+        """Return a message of this channel with every number 0."""
+        return self._plan(tuple(b"" for _ in self._text_bindings))[1][PREFIX.itemsize :].tobytes()
+
     def encode(
         self,
         columns: Mapping[str, NDArray[Any]],

@@ -34,7 +34,7 @@ from .chunks import (
     read_index,
     split,
 )
-from .codec import Decoder, Messages
+from .codec import Decoder, Encoder, Messages
 from .definitions import load, long_name, parse_full
 from .errors import Finding, MarchaError, UsageError
 from .schemas import SCHEMAS, Schema
@@ -266,7 +266,7 @@ class Recording:
         with _Pool(len(refs)) as pool:
             for tables in pool.map(lambda ref: self._decode(ref, [source], start_ns, end_ns), refs):
                 parts += tables.values()
-        table = _join(parts, self._empty(source))
+        table = _join(parts) if parts else self._empty(source)
         return table if log_time else table.drop("t_log_ns")
 
     def windows(
@@ -479,24 +479,24 @@ class Recording:
             yield Window(start, end, tables)
 
     def _empty(self, source: Source) -> pl.DataFrame:
-        columns = self.channels[source.topic].columns
-        known = SCHEMAS.get(source.schema)
-        kinds = {c.name: c for c in known.columns} if known else {}
-        types: dict[str, Any] = {
-            "number": pl.Float64,
-            "sigma": pl.Float64,
-            "flag": pl.Boolean,
-            "time": pl.Int64,
-        }
-        schema = {c: types.get(kinds[c].kind, pl.String) if c in kinds else pl.Float64 for c in columns}
-        return pl.DataFrame(schema=_NOW | schema)
+        """Return a table without rows, its columns of the types that rows would have."""
+        if isinstance(source.decoder, EventDecoder):
+            return source.decoder.decode(_nothing(b""))
+        channel = self.channels[source.topic]
+        if channel.count and (first := self._first(source)) is not None:
+            return first[0].clear()
+        if source.decoder is None or source.decoder.schema is None or not channel.columns:
+            return pl.DataFrame(schema=_NOW)
+        encoder = Encoder(source.decoder.schema, channel.columns, channel.frame_id, channel.topic, 0)
+        return source.decoder.decode(_nothing(encoder.blank())).clear()
 
     def _describe(self, source: Source, spans: dict[int, tuple[int, int, int]]) -> Channel:
         here = [spans[i] for i in source.ids if i in spans]
         count = sum(s[0] for s in here)
         columns, frame_id = source.declared or (), source.metadata.get("frame_id", "")
         if source.declared is None and source.decoder is not None and count:
-            columns, frame_id = self._first(source)
+            first = self._first(source)
+            columns, frame_id = ((), "") if first is None else (tuple(first[0].columns[2:]), first[1])
         return Channel(
             source.topic,
             source.schema,
@@ -508,8 +508,8 @@ class Recording:
             {k: v for k, v in source.metadata.items() if k not in RESERVED},
         )
 
-    def _first(self, source: Source) -> tuple[tuple[str, ...], str]:
-        """Return columns and frame id of a foreign channel from its first readable chunk."""
+    def _first(self, source: Source) -> tuple[pl.DataFrame, str] | None:
+        """Return the first readable message of a channel as a row, and its frame id."""
         for ref in self.chunk_refs(set(source.ids)):
             try:
                 parts = split(read_chunk(self.file, ref), source.ids)
@@ -519,13 +519,13 @@ class Recording:
             for messages in parts.values():
                 assert source.decoder is not None
                 try:
-                    table = source.decoder.decode(messages.take(slice(0, 1)))
-                    return tuple(table.columns[2:]), source.decoder.frame_id(messages.message(0))
+                    row = source.decoder.decode(messages.take(slice(0, 1)))
+                    return row, source.decoder.frame_id(messages.message(0))
                 except CdrError as e:
                     add_finding(self.findings, "unreadable_channel", f"{source.topic}: {e}; listed, not read")
                     source.decoder = None
-                    return (), ""
-        return (), ""
+                    return None
+        return None
 
     def _spans(self) -> dict[int, tuple[int, int, int]]:
         """Return count, first and last log time of every channel id."""
@@ -587,6 +587,12 @@ class _Pool:
             yield jobs.popleft().result()
 
 
+def _nothing(message: bytes) -> Messages:
+    """Return one message at time 0, or none where it is empty."""
+    zeros = np.zeros(min(1, len(message)), np.int64)
+    return Messages(np.frombuffer(message, "u1"), zeros, zeros + len(message), zeros, zeros)
+
+
 def _between(messages: Messages, start_ns: int | None, end_ns: int | None) -> Any:
     if start_ns is None and end_ns is None:
         return None
@@ -598,11 +604,8 @@ def _between(messages: Messages, start_ns: int | None, end_ns: int | None) -> An
     return keep
 
 
-def _join(parts: list[pl.DataFrame], empty: pl.DataFrame | None = None) -> pl.DataFrame:
+def _join(parts: list[pl.DataFrame]) -> pl.DataFrame:
     """Return the parts as one table in log-time order (stable)."""
-    if not parts:
-        assert empty is not None
-        return empty
     same = all(p.schema == parts[0].schema for p in parts)
     table = pl.concat(parts, how="vertical" if same else "diagonal_relaxed", rechunk=True)
     log = table["t_log_ns"]

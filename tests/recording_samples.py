@@ -13,7 +13,9 @@ import marcha.recording as mr
 STEP_NS = 10_000_000
 
 
-def sample_table(schema: str, rows: int = 50, seed: int = 0, start_ns: int = 1_700_000_000_123_456_789) -> pl.DataFrame:
+def sample_table(
+    schema: str, rows: int = 50, seed: int = 0, start_ns: int = 1_700_000_000_123_456_789
+) -> pl.DataFrame:
     """Return a table with every column that the type may have, plausible values and a NaN here and there."""
     rng = np.random.default_rng(seed)
     t_ns = start_ns + STEP_NS * np.arange(rows, dtype=np.int64)
@@ -51,7 +53,9 @@ def write(path: Path, topics: dict[str, tuple[str, pl.DataFrame]], **options: An
     """Write tables by topic and return the path."""
     with mr.create(path, **options) as out:
         for topic, (schema, table) in topics.items():
-            out.add_table(topic, schema, table, frame_id="frame" if schema != "tf2_msgs/msg/TFMessage" else "")
+            out.add_table(
+                topic, schema, table, frame_id="frame" if schema != "tf2_msgs/msg/TFMessage" else ""
+            )
     return path
 
 

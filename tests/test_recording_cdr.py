@@ -73,14 +73,18 @@ def libraries(draw) -> dict[str, Definition]:
         fields = []
         for k in range(draw(st.integers(1, 5))):
             kinds = [*NUMBERS, "string", *(d.name for d in out)]
-            fields.append(Field(f"f{k}", draw(st.sampled_from(kinds)), draw(st.sampled_from([None, None, -1, 2]))))
+            fields.append(
+                Field(f"f{k}", draw(st.sampled_from(kinds)), draw(st.sampled_from([None, None, -1, 2])))
+            )
         out.append(Definition(f"pkg/M{i}", tuple(fields), {}))
     return {d.name: d for d in reversed(out)}
 
 
 def value_of(draw, type_: str, library):
     if type_ == "string":
-        return draw(st.text(st.characters(blacklist_characters="\0", blacklist_categories=["Cs"]), max_size=9))
+        return draw(
+            st.text(st.characters(blacklist_characters="\0", blacklist_categories=["Cs"]), max_size=9)
+        )
     if type_ in library:
         return message_of(draw, library[type_], library)
     kind = np.dtype(PRIMITIVES[type_])
@@ -151,7 +155,8 @@ def test_bytes_that_are_no_message_raise_only_cdr_error(data, noise):
 
 
 @pytest.mark.parametrize(
-    ("raw", "says"), [(b"", "0 bytes"), (b"\x00\x03\x00\x00\0\0\0\0", "encapsulation"), (b"\0\1\0\0\1", "5 bytes")]
+    ("raw", "says"),
+    [(b"", "0 bytes"), (b"\x00\x03\x00\x00\0\0\0\0", "encapsulation"), (b"\0\1\0\0\1", "5 bytes")],
 )
 def test_what_is_wrong_with_a_message_is_said(raw, says):
     library = load("builtin_interfaces/Time")

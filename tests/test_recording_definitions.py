@@ -45,9 +45,7 @@ def test_every_column_has_a_field(schema):
 
 
 def test_bounds_defaults_constants_and_comments():
-    text = (
-        "# head\nuint8 A=1 # one\nstring<=5 name 'x # y'\nfloat32[<=3] few\nint16[2] pair [1, 2]\nHeader header\n"
-    )
+    text = "# head\nuint8 A=1 # one\nstring<=5 name 'x # y'\nfloat32[<=3] few\nint16[2] pair [1, 2]\nHeader header\n"
     definition = parse("pkg/msg/Odd", text)
     assert [(f.name, f.type, f.length) for f in definition.fields] == [
         ("name", "string", None),
