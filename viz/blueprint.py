@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 import rerun.blueprint as rrb
 
+from . import plan
 from .scene import TIMELINE, Entry, Floats, Scene
 from .track import STANDING_M, Track, framed
 
@@ -90,40 +91,52 @@ def _lanes(entries: Sequence[Entry]) -> list[rrb.StateTimelineView]:
     ]
 
 
-def _space(
-    scenes: Sequence[Scene], entries: Sequence[Entry], name: str, *, above: bool = False
-) -> rrb.Spatial3DView:
-    """Return the 3D view of all tracks, from the side or straight from above."""
-    low, high = _extent(scenes)
-    centre, size = (low + high) / 2, max(float(np.linalg.norm((high - low)[:2])), 2.0)
-    if above:
-        eye = rrb.EyeControls3D(
-            position=centre + (0.0, -1e-3 * size, 1.1 * size), look_target=centre, eye_up=(0.0, 1.0, 0.0)
-        )
-    else:
-        eye = rrb.EyeControls3D(
-            position=centre + (-0.12 * size, -0.78 * size, 0.62 * size), look_target=centre, eye_up=(0.0, 0.0, 1.0)
-        )
-    whole = all(t.seen <= TRAIL_ROWS for s in scenes for t in s.tracks.values())
+def _spatial(entries: Sequence[Entry]) -> list[str]:
+    return [e.path for e in _of(entries, *SPATIAL)]
+
+
+def _past(scenes: Sequence[Scene], entries: Sequence[Entry]) -> dict[str, rrb.VisibleTimeRanges]:
+    """Return what of its past each entity shows: trails and footprints all up to the cursor."""
     boundary = rrb.TimeRangeBoundary
-    trail = rrb.VisibleTimeRanges(
-        timeline=TIMELINE,
-        start=boundary.infinite() if whole else boundary.cursor_relative(seconds=-TRAIL_S),
-        end=boundary.cursor_relative(),
+    end = boundary.cursor_relative()
+    past = rrb.VisibleTimeRanges(timeline=TIMELINE, start=boundary.infinite(), end=end)
+    short = rrb.VisibleTimeRanges(
+        timeline=TIMELINE, start=boundary.cursor_relative(seconds=-TRAIL_S), end=end
     )
-    past = rrb.VisibleTimeRanges(timeline=TIMELINE, start=boundary.infinite(), end=boundary.cursor_relative())
+    whole = all(t.seen <= TRAIL_ROWS for s in scenes for t in s.tracks.values())
+    return {
+        e.path: past if whole or e.role == "footprints" else short for e in _of(entries, "trail", "footprints")
+    }
+
+
+def _space(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Spatial3DView:
+    """Return the 3D view of all tracks."""
+    low, high = extent(scenes)
+    centre, size = (low + high) / 2, max(float(np.linalg.norm((high - low)[:2])), 2.0)
     return rrb.Spatial3DView(
         origin="/",
-        contents=[e.path for e in _of(entries, *SPATIAL)],
-        name=name,
-        eye_controls=eye,
+        contents=_spatial(entries),
+        name="track",
+        eye_controls=rrb.EyeControls3D(
+            position=centre + np.array([-0.12, -0.78, 0.62]) * size, look_target=centre, eye_up=(0.0, 0.0, 1.0)
+        ),
         background=rrb.Background(kind="SolidColor", color=BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=True, spacing=1.0, color=(255, 255, 255, 24)),
         spatial_information=rrb.SpatialInformation(target_frame="tf#/", show_axes=True),
-        overrides={
-            **{e.path: trail for e in _of(entries, "trail")},
-            **{e.path: past for e in _of(entries, "footprints")},
-        },
+        overrides=_past(scenes, entries),
+    )
+
+
+def _plan(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Spatial2DView:
+    """Return the 2D view of all tracks from above."""
+    bounds = [-0.1 * plan.PIXELS, 1.1 * plan.PIXELS]  # the grid reaches beyond the camera's picture
+    return rrb.Spatial2DView(
+        origin=plan.CAMERA,
+        contents=[*_spatial(entries), plan.GRID, plan.TICKS],
+        name="from above",
+        background=rrb.Background(kind="SolidColor", color=BACKGROUND),
+        visual_bounds=rrb.VisualBounds2D(x_range=bounds, y_range=bounds),
+        overrides=_past(scenes, entries),
     )
 
 
@@ -134,7 +147,7 @@ def _framed(scenes: Sequence[Scene]) -> tuple[list[Track], bool]:
     return chosen, len(chosen) == len(tracks)
 
 
-def _extent(scenes: Sequence[Scene]) -> tuple[Floats, Floats]:
+def extent(scenes: Sequence[Scene]) -> tuple[Floats, Floats]:
     """Return the corners (3,), (3,) of the tracks as shown; a room of 10 m where nothing is known yet."""
     tracks, _ = _framed(scenes)
     if not tracks:
@@ -165,7 +178,7 @@ def _overview(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Containe
         return rrb.Vertical(*plots, row_shares=shares, name="Overview") if plots else None
     left: list[rrb.View] = []
     if _of(entries, "track"):
-        left.append(_space(scenes, entries, "track"))
+        left.append(_space(scenes, entries))
     if fixes := _of(entries, "map"):
         left.append(rrb.MapView(origin="/", contents=[e.path for e in fixes], name="map"))
     return rrb.Horizontal(
@@ -236,7 +249,7 @@ def _compare(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Container
     if not plots:
         plots += _height(scenes, entries)
     return rrb.Horizontal(
-        _space(scenes, entries, "from above", above=True),
+        _plan(scenes, entries),
         rrb.Vertical(*plots),
         column_shares=[1, 1],
         name="Compare",

@@ -10,7 +10,8 @@ from ..recording import Recording
 from ..recording.atomic import AtomicFile
 from ..recording.errors import MarchaError
 from ..recording.selection import Selection, selected_topics, within
-from .blueprint import blueprint
+from .blueprint import blueprint, extent
+from .plan import log_plan
 from .report import report
 from .scene import Clock, Scene
 
@@ -89,6 +90,7 @@ def draw(
         text = rr.TextDocument(report(rec), media_type=rr.MediaType.MARKDOWN)
         scene.static(f"{scene.prefix}/report", text)
         scenes.append(scene)
+    log_plan(stream, *extent(scenes))
     stream.send_blueprint(blueprint(scenes))
     return scenes
 
@@ -101,10 +103,14 @@ def check_whole(file: AtomicFile) -> None:
     MarchaError
         It does not; nothing is left.
     """
+    import warnings
+
     from rerun.chunk import RrdReader
 
     try:
-        RrdReader(file.part).store()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # it warns of what is raised here
+            RrdReader(file.part).store()
     except Exception as error:
         file.abort()
         reason = str(error).splitlines()[0]

@@ -148,8 +148,9 @@ class LiveSink:
         """Draw what needs the whole, and put the file in its place; ``result`` is None where the replay failed."""
         import rerun as rr
 
-        from .blueprint import blueprint
+        from .blueprint import blueprint, extent
         from .draw import check_whole
+        from .plan import log_plan
         from .report import replay_report
 
         if result is None:
@@ -160,6 +161,7 @@ class LiveSink:
             scene.end()
             text = rr.TextDocument(replay_report(result), media_type=rr.MediaType.MARKDOWN)
             scene.static(f"{scene.prefix}/report", text)
+            log_plan(self._stream, *extent([scene]))
             # the saved view opens at the whole track; open viewers keep what their user has arranged
             self._stream.send_blueprint(blueprint([scene]), make_active=False)
             self._stream.flush()
@@ -180,12 +182,14 @@ class LiveSink:
 
     def _begun(self, t_ns: int) -> Scene:
         """Return the scene; its clock is known with the first message."""
-        from .blueprint import blueprint
+        from .blueprint import blueprint, extent
         from .draw import clock_from
+        from .plan import log_plan
         from .scene import Scene
 
         if self._scene is None:
             self._scene = Scene(self._stream, self._plan.channels.values(), clock_from(t_ns))
             self._scene.begin()
+            log_plan(self._stream, *extent([self._scene]))  # a room of 10 m until more is known
             self._stream.send_blueprint(blueprint([self._scene], live=True))
         return self._scene

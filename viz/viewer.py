@@ -72,7 +72,8 @@ class Viewer:
         self.close()
         self._said.seek(0)
         lines = [line for line in self._said.read().decode(errors="replace").splitlines() if line.strip()]
-        raise MarchaError(f"the Rerun viewer did not start: {lines[-1] if lines else 'it said nothing'}")
+        said = next((line for line in lines if "error" in line.lower()), lines[-1] if lines else "it said nothing")
+        raise MarchaError(f"the Rerun viewer did not start: {said}")
 
     @property
     def running(self) -> bool:

@@ -1,0 +1,103 @@
+"""The viewer itself: it shows every tab without a complaint, and listens on this machine only."""
+
+from __future__ import annotations
+
+import io
+import os
+import socket
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+import marcha.recording as mr
+import marcha.replay as rp
+import marcha.viz as viz
+from marcha.recording.errors import MarchaError
+from marcha.viz import viewer
+from marcha.viz.screenshot import screenshots
+
+from .test_viz_rrd import RUN, write_walk
+
+ICD = [Path("/usr/share/vulkan/icd.d"), Path("/etc/vulkan/icd.d")]
+needs_vulkan = pytest.mark.skipif(
+    not any(list(folder.glob("*.json")) for folder in ICD) and "VK_DRIVER_FILES" not in os.environ,
+    reason="no Vulkan driver (Debian: apt-get install mesa-vulkan-drivers libvulkan1)",
+)
+
+
+@pytest.fixture(scope="module")
+def rrd(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("viewer")
+    raw = write_walk(folder / "walk.mcap")
+    rp.replay(raw, ["foot.9iez", "foot.naive"], out=folder / "done.mcap")
+    return viz.write_rrd(mr.open(folder / "done.mcap"), folder / "done.rrd")
+
+
+@pytest.mark.vulkan
+@needs_vulkan
+def test_no_view_complains_and_every_tab_has_a_picture(rrd: Path) -> None:
+    from PIL import Image
+
+    tabs = ["Overview", "Raw", "Detector", "Compare", "Report"]
+    pictures = screenshots(rrd, tabs, at=0.6)
+    assert [p.tab for p in pictures] == tabs
+    for picture in pictures:
+        assert picture.reports == (), picture.tab
+        pixels = np.asarray(Image.open(io.BytesIO(picture.png)).convert("L"), dtype=float)
+        assert pixels.shape == (900, 1600)
+        assert np.ptp(pixels) > 100 and pixels.std() > 8, f"{picture.tab} is blank"
+    assert len({p.png for p in pictures}) == len(tabs)
+
+
+@pytest.mark.vulkan
+@needs_vulkan
+def test_a_tab_that_is_not_there_is_named(rrd: Path) -> None:
+    with pytest.raises(MarchaError, match="no tab 'Map'; it has"):
+        screenshots(rrd, ["Map"])
+
+
+@pytest.mark.vulkan
+@needs_vulkan
+def test_a_replay_is_seen_live(rrd: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from rerun.experimental import ViewerClient
+
+    native = viewer.native
+    monkeypatch.setattr(viewer, "native", lambda: native(headless=True))
+    sink = viz.LiveSink(show=True)
+    rp.replay(mr.open(rrd.parent / "walk.mcap"), ["foot.9iez"], sinks=[sink])
+    (window,) = sink.viewers
+    with window:
+        client = ViewerClient.connect(viewer.uri(window.port))
+        schema = client.get_recording_schema(paths_only=True)
+        assert {f"/run/{RUN}/trail", "/foot/imu1/acc", "/report"} <= {e.entity_path for e in schema.entities}
+        assert client.get_state().views
+
+
+def listening(process: psutil.Process) -> set[str]:
+    """Return the addresses at which a process or its children listen."""
+    family = [process, *process.children(recursive=True)]
+    return {c.laddr.ip for p in family for c in p.net_connections("tcp") if c.status == psutil.CONN_LISTEN}
+
+
+def test_the_web_viewer_serves_this_machine_only_and_ends() -> None:
+    with viewer.web(open_browser=False) as window:
+        process = psutil.Process(window._process.pid)
+        family = [process, *process.children(recursive=True)]
+        assert listening(process) == {"127.0.0.1"}
+        page = urllib.request.urlopen(window.address, timeout=10).read()
+        assert b"<title>" in page
+        assert f"{window.port}" in window.address
+    assert not window.running
+    gone, alive = psutil.wait_procs(family, timeout=10)
+    assert not alive, gone
+
+
+def test_a_viewer_that_cannot_start_says_why() -> None:
+    with socket.socket() as taken:
+        taken.bind((viewer.HOST, 0))
+        port = taken.getsockname()[1]
+        with pytest.raises(MarchaError, match="did not start: .*wrong-option"):
+            viewer.Viewer(["--wrong-option"], port)
