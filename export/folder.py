@@ -39,8 +39,8 @@ def whole_folder(path: Path, *, overwrite: bool = False, marker: str = MARKER) -
         ``path`` is a file, or a folder of something else, or its parent does not exist, or the disk is full.
     """
     path = Path(os.path.abspath(path))
-    _may_be_created(path, overwrite, marker)
     _remove_leftovers(path)
+    _may_be_created(path, overwrite, marker)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         part.mkdir()

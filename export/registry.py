@@ -75,14 +75,23 @@ def export(
 
 
 def _typed(exporter: type[Exporter], options: Mapping[str, Any]) -> msgspec.Struct:
-    fields = {field.name: field for field in msgspec.structs.fields(exporter.Options)}
+    """Return the exporter's options; text becomes the option's type, a list is separated by commas."""
+    about = msgspec.inspect.type_info(exporter.Options)
+    assert isinstance(about, msgspec.inspect.StructType)
+    kinds = {field.name: _plain(field.type) for field in about.fields}
     values: dict[str, Any] = {}
     for key, value in options.items():
-        if key not in fields:
-            known = ", ".join(fields) or "none"
+        if key not in kinds:
+            known = ", ".join(kinds) or "none"
             raise UsageError(f"export option {key!r}: {exporter.name} does not have it; it has {known}")
+        if isinstance(value, str) and isinstance(kinds[key], msgspec.inspect.VarTupleType):
+            value = [part.strip() for part in value.split(",") if part.strip()]
         values[key] = value
     try:
         return msgspec.convert(values, exporter.Options, strict=False)
     except msgspec.ValidationError as error:
         raise UsageError(f"export option of {exporter.name}: {error}") from None
+
+
+def _plain(kind: msgspec.inspect.Type) -> msgspec.inspect.Type:
+    return _plain(kind.type) if isinstance(kind, msgspec.inspect.Metadata) else kind
