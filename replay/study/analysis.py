@@ -1,7 +1,7 @@
 """From the tidy table of cells to groups, outliers and families of comparisons.
 
-A value is left out as an outlier once, in the finest group it belongs to (filter × detector × configuration), and
-stays out of every pooled group.
+A value is left out as an outlier once, in the finest group it belongs to (filter × detector × configuration),
+and stays out of every pooled group.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SUBSETS = ("all", "unclipped", "clipped")
 
 
 def values(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
-    """Return one row a finished cell and metric: the value in the metric's unit, and whether it is an outlier.
+    """Return one row a finished cell and metric: its value in the metric's unit, and if it is an outlier.
 
     Columns: ``metric, unit, filter, detector, configuration, recording, input, clipped, value, outlier``.
     """
@@ -72,7 +72,7 @@ def _subset(frame: pl.DataFrame, subset: str) -> pl.DataFrame:
 
 
 def groups(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
-    """Summarize every metric by filter, configuration, both, and detector, for all, unclipped and clipped inputs.
+    """Summarize every metric by filter, configuration and detector, for all, unclipped and clipped inputs.
 
     Columns: ``metric, unit, subset``, the factors (empty where pooled) and the fields of
     :class:`~marcha.replay.study.statistics.Group`.
@@ -113,11 +113,12 @@ def outliers(frame: pl.DataFrame) -> pl.DataFrame:
 def comparisons(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     """Compare every pair of levels of one factor, family by family.
 
-    Families, each corrected by Holm on its own: filters within each configuration and pooled; configurations within
-    each filter and pooled (both with the study's first detector); detectors within each filter × configuration.
+    Families, each corrected by Holm on its own: filters within each configuration and pooled; configurations
+    within each filter and pooled (both with the study's first detector); detectors within each filter ×
+    configuration.
 
-    Columns: ``metric, unit, factor`` (what is compared), ``within`` (what is held fixed), ``a, b`` and the fields of
-    :class:`~marcha.replay.study.statistics.Comparison`.
+    Columns: ``metric, unit, factor`` (what is compared), ``within`` (what is held fixed), ``a, b`` and the
+    fields of :class:`~marcha.replay.study.statistics.Comparison`.
     """
     frame = frame.filter(~pl.col("outlier") & pl.col("value").is_finite())
     levels = order(frame, config)
@@ -182,8 +183,8 @@ def _families(levels: dict[str, list[str]], first: str) -> Iterator[tuple[str, d
 def beside_published(group_table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     """Put published means beside the measured ones.
 
-    Columns: ``table, by, metric, unit, filter, detector, configuration, published, published_sd, measured, measured_sd, n,
-    ratio, origin, note``. Measured values are NaN where the study has none.
+    Columns: ``table, by, metric, unit, filter, detector, configuration, published, published_sd, measured,
+    measured_sd, n, ratio, origin, note``. Measured values are NaN where the study has none.
     """
     measured = {
         (r["metric"], r["filter"], r["detector"], r["configuration"]): r
@@ -246,7 +247,8 @@ NEES = {"nees_position_end": 3, "nees_velocity_end": 3}
 def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     """Test every filter's covariance: mean NEES over walks against its chi-square interval.
 
-    Columns: ``metric, filter, detector, configuration`` (empty: all), ``n, mean, median, low, high, verdict``.
+    Columns: ``metric, filter, detector, configuration`` (empty: all), ``n, mean, median, low, high,
+    verdict``.
     """
     rows: list[dict[str, Any]] = []
     done = table.filter(pl.col("status") == "ok")

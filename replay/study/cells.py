@@ -207,7 +207,8 @@ def chosen(rec: Recording, inputs: Sequence[str]) -> list[str] | None:
     topics = [t for t in rec.channels if not t.startswith(NOT_RAW) and any(fnmatchcase(t, g) for g in inputs)]
     if not topics:
         raise MarchaError(
-            f"{rec.path}: no channel matches {', '.join(inputs)}; there are {', '.join(rec.channels) or 'none'}"
+            f"{rec.path}: no channel matches {', '.join(inputs)}; there are "
+            f"{', '.join(rec.channels) or 'none'}"
         )
     return topics
 

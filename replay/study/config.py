@@ -1,7 +1,7 @@
 """What a study is: recordings × estimators × parameters, and how the results are grouped and tested.
 
-A study is described in one TOML file; :class:`StudyConfig` is its exact shape, and unknown keys are refused. A
-preset is such a file that ships with marcha.
+A study is described in one TOML file; :class:`StudyConfig` is its exact shape, and unknown keys are refused.
+A preset is such a file that ships with marcha.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ class Simulate(_Table, frozen=True, kw_only=True):
     seed : int
         First seed. Every walk of the study has a seed of its own, so that samples are independent.
     options : dict
-        Options of the simulator for all walks. A list of two numbers ``[low, high]`` under ``vary`` is drawn anew for
-        each walk.
+        Options of the simulator for all walks. A list of two numbers ``[low, high]`` under ``vary`` is drawn
+        anew for each walk.
     vary : dict of str to [low, high]
         Options drawn uniformly for each walk from its seed (walking speed, stride …).
     configurations : dict of str to dict
@@ -346,7 +346,7 @@ def check(config: StudyConfig, name: str) -> StudyConfig:
         except re.error as error:
             raise no(f"pattern {rule.pattern!r} is no regular expression: {error}") from None
         if isinstance(rule, Grouping):
-            try:  # an empty alternative matches any text: the template's groups are then checked without a file
+            try:  # an empty alternative matches any text: the groups are checked without a file
                 match = re.compile(f"{rule.pattern}|").search("")
                 assert match is not None
                 match.expand(rule.label)

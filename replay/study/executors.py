@@ -79,8 +79,8 @@ class Executor:
         function : callable
             Module-level function; function and tasks must be picklable.
         tasks : sequence
-            Where a pool has to be started, the first task runs here meanwhile, and fills numba's caches on disk
-            once for all workers: it should be a cheap one.
+            Where a pool has to be started, the first task runs here meanwhile, and fills numba's caches on
+            disk once for all workers: it should be a cheap one.
         """
         if self._client is not None:
             return _on_cluster(self._client, function, tasks)
@@ -175,7 +175,8 @@ def _one_by_one(function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outc
                 yield (
                     task,
                     MarchaError(
-                        "the worker process died: out of memory, a crash in compiled code, or a calling script "
+                        "the worker process died: out of memory, a crash in compiled code, or a calling "
+                        "script "
                         "without `if __name__ == '__main__':`"
                     ),
                 )

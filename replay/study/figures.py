@@ -62,7 +62,7 @@ def _samples(frame: pl.DataFrame, factor: str, levels: Sequence[str]) -> dict[st
 def _box(
     ax: Axes, samples: Samples, colours: Sequence[str], positions: Sequence[float], width: float
 ) -> None:
-    """Draw boxes (quartiles, whiskers to 1.5 interquartile ranges), means and, in groups below 20, every value."""
+    """Draw boxes (quartiles, whiskers to 1.5 interquartile ranges), means and, below 20, every value."""
     chosen = [k for k, values in enumerate(samples.values()) if len(values) >= BOX_LEAST]
     everything = list(samples.values())
     if chosen:
@@ -106,7 +106,7 @@ def _scale(ax: Axes, frame: pl.DataFrame, log: bool) -> None:
 
 
 def box_by(frame: pl.DataFrame, config: cfg.StudyConfig, factor: str, log: bool = False) -> Figure:
-    """Box plot of one metric's values (rows of :func:`~marcha.replay.study.analysis.values`) by one factor."""
+    """Box plot by one factor of one metric (its rows of :func:`~marcha.replay.study.analysis.values`)."""
     levels = order(frame, config)[factor]
     samples = _samples(frame, factor, levels)
     figure = Figure(figsize=(max(4.5, 1.6 + 0.9 * len(samples)), 3.8))
@@ -153,7 +153,7 @@ def box_by_both(frame: pl.DataFrame, config: cfg.StudyConfig, log: bool = False)
 
 
 def qq(frame: pl.DataFrame, config: cfg.StudyConfig) -> Figure | None:
-    """Normal Q-Q plots of one metric, a panel a configuration × filter; None where every group is too small."""
+    """Normal Q-Q plots of one metric, a panel a configuration × filter; None where all are too small."""
     from scipy import stats
 
     levels = order(frame, config)
@@ -246,27 +246,32 @@ def _overlay(ax: Axes, cells: Sequence[Cell], face: str, middle: np.ndarray, rea
     ax.text(0.02, 0.98, note, transform=ax.transAxes, va="top", fontsize=8, color=GREY)
 
 
-def consistency(table: pl.DataFrame) -> Figure:
-    """Mean normalized error squared of every filter with the interval that a consistent filter lies in.
+def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> Figure:
+    """Mean normalized error squared by configuration and filter, with the interval of a consistent filter.
 
-    ``table`` has ``metric, filter, mean, low, high`` (see :func:`~marcha.replay.study.analysis.consistency`).
+    ``table`` is that of :func:`~marcha.replay.study.analysis.consistency`.
     """
     metrics = table["metric"].unique(maintain_order=True).to_list()
-    filters = table["filter"].unique(maintain_order=True).to_list()
-    figure = Figure(figsize=(1.5 + 3.4 * len(metrics), 3.6))
+    levels = order(table, config)
+    filters, configurations = levels["filter"], levels["configuration"]
+    figure = Figure(figsize=(1.5 + 4.2 * len(metrics), 3.9))
     axes = figure.subplots(1, len(metrics), squeeze=False)[0]
     for ax, metric in zip(axes, metrics, strict=True):
-        part = table.filter(pl.col("metric") == metric)
+        part = table.filter(metric=metric)
         for row in part.iter_rows(named=True):
-            k = filters.index(row["filter"])
-            ax.plot(k, row["mean"], "o", color=colour(k), markersize=8)
-        low, high = part["low"][0], part["high"][0]
-        ax.axhspan(low, high, color="#bcd9bc", label=f"consistent: {low:.2f} to {high:.2f}")
-        ax.set_xticks(range(len(filters)), filters, rotation=20, ha="right")
-        ax.set_xlim(-0.5, len(filters) - 0.5)
+            i, k = configurations.index(row["configuration"]), filters.index(row["filter"])
+            x = i - 0.3 + 0.6 * (k + 0.5) / len(filters)
+            ax.plot([x, x], [row["low"], row["high"]], color="#9cc79c", linewidth=7, solid_capstyle="butt")
+            ax.plot(x, row["mean"], "o", color=colour(k), markersize=7)
+        ax.set_xticks(range(len(configurations)), configurations)
+        ax.set_xlim(-0.5, len(configurations) - 0.5)
         ax.set_yscale("log")
-        ax.set(title=metric, ylabel="mean NEES (1)")
-        ax.legend(fontsize=8)
+        ax.set(title=metric, xlabel="configuration", ylabel="mean NEES (1)")
+    handles = [
+        Line2D([], [], marker="o", linestyle="", color=colour(k), label=f) for k, f in enumerate(filters)
+    ]
+    band = Patch(facecolor="#9cc79c", label="interval of a consistent filter")
+    figure.legend(handles=[*handles, band], loc="outside lower center", ncols=5, frameon=False)
     figure.suptitle("Consistency of the filters' covariance")
     return figure
 
@@ -329,10 +334,10 @@ def drawings(material: Material, cells: Sequence[Cell], config: cfg.StudyConfig)
         if any(c.clipped for c in own):
             caption += " Dashed: clipped input."
         found.append(Drawing("tracks", "tracks", caption, tracks, (own, config)))
-    pooled = nees.filter((pl.col("configuration") == "") & (pl.col("detector") == first))
-    if len(pooled):
-        caption = f"Mean NEES over all walks{detector}; above the band a filter is too sure of itself."
-        found.append(Drawing("consistency", "consistency", caption, consistency, (pooled,)))
+    single = nees.filter((pl.col("configuration") != "") & (pl.col("detector") == first))
+    if len(single):
+        caption = f"Mean NEES over the walks{detector}; above the band a filter is too sure of itself."
+        found.append(Drawing("consistency", "consistency", caption, consistency, (single, config)))
     return found
 
 

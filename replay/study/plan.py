@@ -119,7 +119,7 @@ def file_digest(path: Path) -> str:
 
 
 def code_digest(estimators: Iterable[str]) -> str:
-    """Return a hash of the code that results depend on: marcha's rooms, its version, and plug-ins' modules."""
+    """Return a hash of the code that results depend on: marcha's rooms and version, plug-ins' modules."""
     root = Path(__file__).parents[2]
     files = [p for room in ("recording", "ingest", "algorithms") for p in (root / room).rglob("*.py")]
     files += (root / "replay").glob("*.py")
@@ -279,13 +279,13 @@ def tasks(
                     folder=str(folder),
                 )
             )
-    # The cheapest first (it warms the caches), then the largest, so that no long task is left for the end.
+    # The cheapest first (it warms the caches), then the largest: no long task is left for the end.
     result.sort(key=lambda t: (-t.source.size, t.source.name))
     return result[-1:] + result[:-1]
 
 
 def preparations(todo: Sequence[Task]) -> list[Task]:
-    """Return a task without jobs for every recording that several tasks share: it is made once, before them."""
+    """Return a task without jobs for every recording that several tasks share: it is made once, first."""
     counts = Counter(task.source.name for task in todo)
     shared = {task.source.name: task for task in todo if counts[task.source.name] > 1}
     return [msgspec.structs.replace(task, jobs=[]) for task in shared.values()]

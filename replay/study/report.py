@@ -200,8 +200,10 @@ def _introduction(html: Html, material: Material) -> None:
     walks, clipped = results["recording"].n_unique(), results.filter("clipped")["recording"].n_unique()
     done = results.filter(pl.col("status") == "ok")
     html.text(
-        f"{walks} recordings, {results['filter'].n_unique()} filters, {max(1, results['detector'].n_unique())} detectors, "
-        f"{len(done)} finished cells, {len(results) - len(done)} failed; {clipped} recordings have clipped inputs. "
+        f"{walks} recordings, {results['filter'].n_unique()} filters, "
+        f"{max(1, results['detector'].n_unique())} detectors, "
+        f"{len(done)} finished cells, {len(results) - len(done)} failed; {clipped} recordings have clipped "
+        "inputs. "
         f"A cell is one filter with one detector on one input of one recording."
     )
     html.warning(material.notes)
@@ -292,7 +294,8 @@ def _published_detectors(html: Html, material: Material) -> None:
 def _methods(html: Html, material: Material, levels: dict[str, list[str]]) -> None:
     html.section("Every filter and detector, clipped inputs apart")
     html.text(
-        "Mean ± standard deviation over all configurations. An input is clipped where a sensor reached its full scale: "
+        "Mean ± standard deviation over all configurations. An input is clipped where a sensor reached its "
+        "full scale: "
         "what it did beyond is not in the data, so its errors are not the filter's alone."
     )
     titles = [cfg.metric_title(m) for m in material.config.metrics]
@@ -320,8 +323,10 @@ def _gallery(html: Html, pictures: Sequence[Picture], title: str, section: str) 
         html.section(title)
         if section == "box":
             html.text(
-                "Box: quartiles and median; whiskers: last value within 1.5 interquartile ranges; diamond: mean; "
-                "dots: single values (all of them in groups below 20; groups below 5 have no box). Outliers of the sigma rule are left out."
+                "Box: quartiles and median; whiskers: last value within 1.5 interquartile ranges; diamond: "
+                "mean; "
+                "dots: single values (all of them in groups below 20; groups below 5 have no box). Outliers "
+                "of the sigma rule are left out."
             )
         html.pictures(pictures)
 
@@ -329,8 +334,10 @@ def _gallery(html: Html, pictures: Sequence[Picture], title: str, section: str) 
 def _consistency(html: Html, material: Material, pictures: Sequence[Picture]) -> None:
     html.section("Consistency of the filters' own covariance")
     html.text(
-        "NEES: the squared error at the end of the walk in units of the filter's covariance. Its mean over independent "
-        "walks lies in the interval if the filter knows how wrong it is; above it the filter is too sure of itself, "
+        "NEES: the squared error at the end of the walk in units of the filter's covariance. Its mean over "
+        "independent "
+        "walks lies in the interval if the filter knows how wrong it is; above it the filter is too sure of "
+        "itself, "
         "below it too careful."
     )
     rows = [
@@ -359,7 +366,8 @@ def _normality(html: Html, material: Material, pictures: Sequence[Picture]) -> N
         (pl.col("subset") == "all") & (pl.col("configuration") != "") & (pl.col("filter") != "")
     )
     html.text(
-        f"Shapiro-Wilk for every filter × configuration. Below p = {level:.2f} the values are hardly normal: read the "
+        f"Shapiro-Wilk for every filter × configuration. Below p = {level:.2f} the values are hardly normal: "
+        "read the "
         "rank test beside Welch's."
     )
     done = tested.filter(pl.col("shapiro_p").is_finite())
@@ -402,9 +410,12 @@ def _comparisons(html: Html, material: Material) -> None:
     twin = {"mann-whitney": "Mann-Whitney U", "brunner-munzel": "Brunner-Munzel"}[statistics.nonparametric]
     html.section("Which means differ")
     html.text(
-        f"Every pair within a family: Welch's t test and {twin}, two-sided, both corrected by Holm within the family, and "
-        f"Hedges' g with its {100 * statistics.confidence:.0f} % interval. Red: below {level:.2f} after the correction. "
-        "Filters run on the same walks; the tests treat their values as independent, as the source does, which makes "
+        f"Every pair within a family: Welch's t test and {twin}, two-sided, both corrected by Holm within "
+        "the family, and "
+        f"Hedges' g with its {100 * statistics.confidence:.0f} % interval. Red: below {level:.2f} after the "
+        "correction. "
+        "Filters run on the same walks; the tests treat their values as independent, as the source does, "
+        "which makes "
         "them careful between filters."
     )
     table = material.comparisons
@@ -425,11 +436,13 @@ def _comparisons(html: Html, material: Material) -> None:
                         [
                             escape(f"{r['a']} − {r['b']}"),
                             f"{r['n_a']}, {r['n_b']}",
-                            f"{number(r['difference'])} ({number(r['difference_low'])} … {number(r['difference_high'])})",
+                            f"{number(r['difference'])} ({number(r['difference_low'])} … "
+                            f"{number(r['difference_high'])})",
                             number(r["welch_t"]),
                             number(r["welch_df"]),
                             marks[0] + probability(r["welch_p_holm"]),
-                            f"{number(r['hedges_g'])} ({number(r['hedges_low'])} … {number(r['hedges_high'])})",
+                            f"{number(r['hedges_g'])} ({number(r['hedges_low'])} … "
+                            f"{number(r['hedges_high'])})",
                             marks[1] + probability(r["rank_p_holm"]),
                         ]
                     )
@@ -461,7 +474,8 @@ def _outliers(html: Html, material: Material) -> None:
         return
     count = len(material.outliers)
     html.text(
-        f"{count} of {len(material.values)} values lie more than {sigma:g} standard deviations from the mean of their filter × "
+        f"{count} of {len(material.values)} values lie more than {sigma:g} standard deviations from the mean "
+        "of their filter × "
         "detector × configuration and are left out of means, plots and tests. "
         f"Among n values none can lie beyond (n − 1)/√n, so the rule needs {_least(sigma)} values to strike."
     )

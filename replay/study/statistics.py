@@ -4,9 +4,10 @@ Everything here takes plain arrays. Where there are too few samples nothing is c
 
 References
 ----------
-Welch, B. L. (1947), Biometrika 34, 28-35. Hedges, L. V. (1981), J. Educational Statistics 6, 107-128 (g and its
-exact correction). Holm, S. (1979), Scand. J. Statistics 6, 65-70. Brunner, E. and Munzel, U. (2000), Biometrical
-Journal 42, 17-25. Steiger, J. H. and Fouladi, R. T. (1997) (interval of an effect size by the noncentral t).
+Welch, B. L. (1947), Biometrika 34, 28-35. Hedges, L. V. (1981), J. Educational Statistics 6, 107-128 (g and
+its exact correction). Holm, S. (1979), Scand. J. Statistics 6, 65-70. Brunner, E. and Munzel, U. (2000),
+Biometrical Journal 42, 17-25. Steiger, J. H. and Fouladi, R. T. (1997) (interval of an effect size by the
+noncentral t).
 """
 
 from __future__ import annotations
@@ -94,8 +95,9 @@ class Comparison(msgspec.Struct, frozen=True):
 def outlier_mask(values: ArrayLike, sigma: float) -> NDArray[np.bool_]:
     """Tell which values lie more than ``sigma`` standard deviations (n − 1) from the mean, in one pass.
 
-    Values that are not finite are neither counted nor flagged. ``sigma`` 0 flags nothing. Among n values none can lie
-    farther than (n − 1)/√n standard deviations from the mean, so three sigma never strikes below 11 values.
+    Values that are not finite are neither counted nor flagged. ``sigma`` 0 flags nothing. Among n values none
+    can lie farther than (n − 1)/√n standard deviations from the mean, so three sigma never strikes below 11
+    values.
     """
     x = np.asarray(values, float)
     good = np.isfinite(x)
@@ -150,8 +152,9 @@ def summarize(values: ArrayLike, *, sigma: float = 3.0, min_samples: int = 3) ->
 def hedges_g(a: ArrayLike, b: ArrayLike, confidence: float = 0.95) -> tuple[float, float, float]:
     """Return Hedges' g of two samples and its interval.
 
-    g = J (mean(a) − mean(b)) / s_pooled with J = Γ(m/2) / (√(m/2) Γ((m − 1)/2)), m = n_a + n_b − 2. The interval are
-    the noncentralities of the t distribution under which the observed t lies at either tail (equal variances assumed).
+    g = J (mean(a) − mean(b)) / s_pooled with J = Γ(m/2) / (√(m/2) Γ((m − 1)/2)), m = n_a + n_b − 2. The
+    interval are the noncentralities of the t distribution under which the observed t lies at either tail
+    (equal variances assumed).
     """
     from scipy import special
 

@@ -1,4 +1,4 @@
-"""Run a study: find the recordings, run the cells that are not there yet, write tables, figures and the report."""
+"""Run a study: find the recordings, run the missing cells, write tables, figures and the report."""
 
 from __future__ import annotations
 
@@ -96,8 +96,10 @@ class StudyResult(msgspec.Struct, frozen=True):
     def lines(self) -> list[str]:
         """A few lines for a terminal."""
         return [
-            f"{self.folder}: {len(self.results)} cells of {self.results['recording'].n_unique()} recordings in "
-            f"{self.elapsed_s:.1f} s ({self.cells_run} run, {self.cells_reused} reused, {self.cells_failed} failed)",
+            f"{self.folder}: {len(self.results)} cells of {self.results['recording'].n_unique()} recordings "
+            "in "
+            f"{self.elapsed_s:.1f} s ({self.cells_run} run, {self.cells_reused} reused, {self.cells_failed} "
+            "failed)",
             *self.notes[:8],
             *([f"… {len(self.notes) - 8} more notes in the report"] if len(self.notes) > 8 else []),
             f"report: {self.folder / 'report.html'}",
@@ -124,24 +126,25 @@ def run_study(
     config : str, Path or StudyConfig
         TOML file, name of a preset, or the configuration itself.
     out_dir : str or Path
-        Folder of the study: ``results.parquet`` and ``.csv`` (one row a cell), ``groups.csv``, ``comparisons.csv``,
-        ``report.html``, ``figures/``, ``study.toml``, ``provenance.json``; ``cells/`` and ``recordings/`` hold
-        what need not be computed again.
+        Folder of the study: ``results.parquet`` and ``.csv`` (one row a cell), ``groups.csv``,
+        ``comparisons.csv``, ``report.html``, ``figures/``, ``study.toml``, ``provenance.json``; ``cells/``
+        and ``recordings/`` hold what need not be computed again.
     data : path or paths, optional
         Folder (or files) of the recordings or raw logs; by default the folder of the TOML file.
     workers : int, optional
         Processes; one a core by default, 1 stays in this process. A script that uses more needs the usual
         ``if __name__ == "__main__":``.
     scheduler : str, optional
-        Address of a Dask scheduler instead; its workers must see the data and ``out_dir`` under the same paths.
+        Address of a Dask scheduler instead; its workers must see the data and ``out_dir`` under the same
+        paths.
     convert, simulate : callable, optional
-        :func:`marcha.ingest.convert` and :func:`marcha.ingest.simulate.simulate`, for studies of raw logs and of
-        simulated walks. (This room imports no other that comes after it; the command line passes them.)
+        :func:`marcha.ingest.convert` and :func:`marcha.ingest.simulate.simulate`, for studies of raw logs and
+        of simulated walks. (This room imports no other that comes after it; the command line passes them.)
     overwrite : bool
         Start anew in a folder that holds a study.
     resume : bool
-        Go on in a folder that holds a study with another configuration, keeping the cells that both share. With the same
-        configuration finished cells are kept anyway.
+        Go on in a folder that holds a study with another configuration, keeping the cells that both share.
+        With the same configuration finished cells are kept anyway.
     progress : callable, optional
         Called with (done, total) cells.
 
@@ -232,7 +235,8 @@ def _claim(folder: Path, toml: str, *, overwrite: bool, resume: bool) -> None:
                 shutil.rmtree(folder / part, ignore_errors=True)
         elif not resume and known.read_text(encoding="utf-8") != toml:
             raise UsageError(
-                f"{folder}: holds a study with another configuration; give another folder, --resume to go on with this one "
+                f"{folder}: holds a study with another configuration; give another folder, --resume to go on "
+                "with this one "
                 "(cells that both share are kept), or --force to start anew"
             )
     write_atomic(known, lambda path: path.write_text(toml, encoding="utf-8"))
