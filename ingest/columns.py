@@ -79,11 +79,12 @@ def require_header(path: Path, accept: Callable[[Sequence[str]], bool], wanted: 
     return header
 
 
-def float_blocks(path: Path, header: Header, report: ReportBuilder) -> Iterator[pl.DataFrame]:
+def float_blocks(path: Path, header: Header, required: str, report: ReportBuilder) -> Iterator[pl.DataFrame]:
     """Yield the rows behind the header: one Float64 column a name, and ``line`` (Int64).
 
     A cell without a value is NaN, as is one that is no number (a repair, ``missing_cell``). Rows with another
-    number of cells than the header are dropped as ``bad_row``; blank lines are nothing.
+    number of cells than the header, or without a number in the column ``required``, are dropped as
+    ``bad_row``; blank lines are nothing.
 
     Raises
     ------
@@ -98,11 +99,13 @@ def float_blocks(path: Path, header: Header, report: ReportBuilder) -> Iterator[
         )
     names = {f"c{i}": name for i, name in enumerate(header.names) if name}
     for block in cells.rows([int(c[1:]) for c in names], report):
+        block = _with_number(
+            block, next(c for c, name in names.items() if name == required), required, report
+        )
         columns = {"line": block["line"]}
         for place, name in names.items():
             text = block[place].str.strip_chars()
-            value = text.cast(pl.Float64, strict=False)
-            value = pl.select(pl.when(value.is_finite()).then(value)).to_series()
+            value = _numbers(text)
             given = text.is_not_null() & ~text.str.to_lowercase().is_in(MISSING)
             odd = given & value.is_null()
             if odd.any():
@@ -116,3 +119,24 @@ def float_blocks(path: Path, header: Header, report: ReportBuilder) -> Iterator[
                 )
             columns[name] = value.fill_null(math.nan)
         yield pl.DataFrame(columns)
+
+
+def _numbers(text: pl.Series) -> pl.Series:
+    """Return finite numbers, null for anything else."""
+    value = text.cast(pl.Float64, strict=False)
+    return pl.select(pl.when(value.is_finite()).then(value)).to_series()
+
+
+def _with_number(block: pl.DataFrame, place: str, name: str, report: ReportBuilder) -> pl.DataFrame:
+    """Return the rows with a number in column ``place``; the others are bad rows."""
+    bad = _numbers(block[place].str.strip_chars()).is_null()
+    if not bad.any():
+        return block
+    at = int(bad.arg_true()[0])
+    report.drop(
+        "bad_row",
+        f"{name}: {block[place][at]!r} is not a number; row dropped",
+        count=int(bad.sum()),
+        line=block["line"][at],
+    )
+    return block.filter(~bad)

@@ -303,17 +303,3 @@ class Plateau:
                     line=line,
                     subject=f"{self._subject} {axis} {sign}",
                 )
-
-
-def drop_untimed(frame: pl.DataFrame, name: str, report: ReportBuilder) -> pl.DataFrame:
-    """Return the rows whose time (cell ``name``) is a number; the others are bad rows."""
-    bad = frame[name].is_nan()
-    if bad.any():
-        report.drop(
-            "bad_row",
-            f"{name}: no time; row dropped",
-            count=int(bad.sum()),
-            line=int(frame["line"].filter(bad)[0]),
-        )
-        return frame.filter(~bad)
-    return frame

@@ -39,7 +39,6 @@ from .inertial import (
     Plan,
     Source,
     complete,
-    drop_untimed,
     note_mirror,
     note_unused,
     tables,
@@ -199,8 +198,7 @@ def _columns(header: Header, node: str) -> dict[str, Source]:
 def _frames(
     path: Path, header: Header, angles: dict[str, str], report: ReportBuilder
 ) -> Iterator[pl.DataFrame]:
-    for frame in float_blocks(path, header, report):
-        frame = drop_untimed(frame, "Time", report)
+    for frame in float_blocks(path, header, "Time", report):
         if angles:
             quat = _north_west_up(*(frame[angles[a]].to_numpy() for a in _ANGLES))
             frame = frame.with_columns(*(pl.Series(n, q) for n, q in zip(QUAT, quat, strict=True)))
@@ -224,7 +222,7 @@ def _footprints(path: Path, mirror: Mirror) -> tuple[pl.DataFrame, dict[str, str
     header = require_header(path, _is_footprints, ",".join(FOOTPRINTS))
     report = ReportBuilder()
     report.refuse_changes(path)
-    frames = list(float_blocks(path, header, report))
+    frames = list(float_blocks(path, header, "timestamp", report))
     table = pl.concat(frames) if frames else pl.DataFrame()
     if table.height < 2 or table.select(pl.col(FOOTPRINTS[1:]).is_nan().any()).row(0) != (False,) * 3:
         raise MarchaError(f"{path}: a table of footprints has at least two rows and no empty cells")

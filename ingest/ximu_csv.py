@@ -27,7 +27,6 @@ from .inertial import (
     MAG,
     Plan,
     complete,
-    drop_untimed,
     note_unused,
     one_file,
     tables,
@@ -103,8 +102,7 @@ def _is_header(cells: Sequence[str]) -> bool:
 def _frames(path: Path, header: Header, rate_hz: float, report: ReportBuilder) -> Iterator[pl.DataFrame]:
     """Yield rows with a time ``t`` (ns) made of their place in the file and the packets that were lost."""
     row, last, a_row = -1, None, None
-    for frame in float_blocks(path, header, report):
-        frame = drop_untimed(frame, COUNTER, report)
+    for frame in float_blocks(path, header, COUNTER, report):
         if not frame.height:
             continue
         counter = frame[COUNTER].to_numpy()

@@ -24,7 +24,6 @@ from .inertial import (
     Plan,
     Source,
     complete,
-    drop_untimed,
     note_unused,
     one_file,
     tables,
@@ -82,6 +81,5 @@ def _is_header(cells: Sequence[str]) -> bool:
 
 
 def _frames(path: Path, header: Header, time: Source, report: ReportBuilder) -> Iterator[pl.DataFrame]:
-    for frame in float_blocks(path, header, report):
-        frame = drop_untimed(frame, time.name, report)
+    for frame in float_blocks(path, header, time.name, report):
         yield frame.with_columns(t=(pl.col(time.name) * time.factor).round().cast(pl.Int64)).drop(time.name)

@@ -13,6 +13,8 @@ import scipy.io
 from hypothesis import given
 from hypothesis import strategies as st
 from marcha.ingest import Import, Report
+from marcha.ingest.contract import ReportBuilder
+from marcha.ingest.inertial import Plateau
 from marcha.ingest.registry import make_options
 from marcha.ingest.sensorconnect_csv import SensorConnectCsv
 from marcha.ingest.simulate import Walk, walk
@@ -234,7 +236,7 @@ def test_damaged_rows_are_dropped_and_cells_become_nan(tmp_path: Path, truth: Wa
     imu = tables["/foot/imu"]
     assert len(imu) == len(truth.t) - 2
     assert imu["acc_z"].is_nan().sum() == 2
-    assert report.rows_dropped == 2
+    assert (report.rows_dropped, report.rows_repaired) == (2, 1)
     assert {(f.kind, f.first_line) for f in report.findings} >= {
         ("bad_row", 21),
         ("missing_cell", 41),
@@ -249,6 +251,16 @@ def test_clipping_is_found_where_the_full_scale_is_unknown(tmp_path: Path, truth
     _, _, report = read(XioCsv(), path)
     assert findings(report)["clipped"] == (np.abs(clipped) == 2).sum()
     assert report.lossy
+
+
+def test_clipping_is_counted_over_blocks() -> None:
+    report = ReportBuilder()
+    plateau = Plateau(report, "/foot/imu", ["acc_x"])
+    for first, block in ((1, [1.0, 2 * G]), (3, [2 * G, 0.0]), (5, [2 * G, -1.0])):
+        plateau.feed([np.array(block)], np.array([first, first + 1]))
+    plateau.finish()
+    found = report.build().findings
+    assert [(f.kind, f.count, f.first_line) for f in found] == [("clipped", 3, 2)]
 
 
 def test_ximu_time_is_the_assumed_rate_not_the_counter(tmp_path: Path, truth: Walk) -> None:
@@ -268,10 +280,18 @@ def test_ximu_lost_packets_move_the_time(tmp_path: Path, truth: Walk) -> None:
     expected = np.delete(np.round(np.arange(len(truth.t)) * 1e9 / 256), slice(200, 240))
     off = (tables["/foot/imu"]["t_ns"].to_numpy() - expected) * 256e-9
     assert not off[:200].any()
-    assert np.abs(off[200:]).max() <= 1.01  # which of the lost packets were inertial is an estimate
+    np.testing.assert_allclose(off[200:], 0, atol=0.01)
     gap = next(f for f in report.findings if f.kind == "gap")
     assert (gap.count, gap.first_line) == (1, 202)
     assert report.lossy
+
+
+def test_ximu_the_fewest_lost_packets_that_are_sure(tmp_path: Path, truth: Walk) -> None:
+    rows = ximu(truth).splitlines()
+    (path := tmp_path / "w.csv").write_bytes(b"\n".join(rows[:201] + rows[204:]) + b"\n")  # a step of 6
+    _, tables, report = read(XimuCsv(), path)
+    assert findings(report)["gap"] == 1
+    assert tables["/foot/imu"]["t_ns"][200] == round(203 * 1e9 / 256)
 
 
 def test_ximu_a_single_lost_packet_proves_nothing(tmp_path: Path, truth: Walk) -> None:

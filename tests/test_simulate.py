@@ -117,6 +117,16 @@ def test_stairs_climb(direction: str, height: float) -> None:
     assert w.steps["height_m"].sum() == pytest.approx(height, abs=1e-9)
 
 
+@pytest.mark.parametrize("direction", ["up", "down"])
+def test_the_foot_passes_over_the_edge_of_the_steps(direction: str) -> None:
+    w = sim.walk("stairs", direction=direction, heel_toe_roll=False)
+    low, high = sorted((0.0, 2 * 0.17))
+    for start, end in w.steps.select("start_ns", "end_ns").rows():
+        swing = w.pos[(w.t_ns >= start) & (w.t_ns <= end)]
+        half = np.argmin(np.abs(swing[:, 0] - (swing[0, 0] + swing[-1, 0]) / 2))
+        assert swing[half, 2] - min(swing[0, 2], swing[-1, 2]) > low + 0.8 * (high - low)
+
+
 def test_still_never_moves_and_reads_gravity() -> None:
     w = sim.walk("still", duration_s=12)
     assert w.t[-1] == pytest.approx(12, abs=0.02)
@@ -186,8 +196,9 @@ def test_errors_have_their_size() -> None:
     np.testing.assert_allclose(acc.std(0), 0.004 * np.sqrt(100), rtol=0.03)  # density · √rate
     np.testing.assert_allclose(gyr.std(0), 0.0003 * np.sqrt(100), rtol=0.03)
     moving = sim.walk("straight")
-    tilted = moving.measured(sim.ImuErrors(**{**_off(), "gyr_misalignment": (0.0, 0.0, 0.02)}))[1]
-    np.testing.assert_allclose(tilted - moving.gyr_b, np.cross([0, 0, 0.02], moving.gyr_b), atol=1e-12)
+    turned = (0.01, -0.03, 0.02)
+    tilted = moving.measured(sim.ImuErrors(**{**_off(), "gyr_misalignment": turned}))[1]
+    np.testing.assert_allclose(tilted - moving.gyr_b, np.cross(turned, moving.gyr_b), atol=1e-12)
 
 
 def _off() -> dict:
