@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
@@ -88,6 +90,16 @@ class Clock:
     def nominal_ns(self) -> int | None:
         """Median interval of the first block, in nanoseconds; None before two rows were seen."""
         return None if self._nominal is None else self._nominal * self._tick_ns
+
+    def stream(self, frames: Iterable[pl.DataFrame]) -> Iterator[pl.DataFrame]:
+        """Feed all of ``frames`` and yield what is settled, to the end; empty frames are left out."""
+        empty: pl.DataFrame | None = None
+        for frame in frames:
+            empty = frame.clear()
+            if (settled := self.feed(frame)).height:
+                yield settled
+        if empty is not None and (settled := self.feed(empty, final=True)).height:
+            yield settled
 
     def feed(self, frame: pl.DataFrame, *, final: bool = False) -> pl.DataFrame:
         """Return the rows that are settled, with ``t_ns`` (Int64, never decreasing) in the place of ``t``."""

@@ -224,6 +224,7 @@ def _metadata(
     records["provenance"] = provenance
     records["import_report"] = {
         **{k: str(getattr(report, k)) for k in ("rows_read", "rows_kept", "rows_repaired", "rows_dropped")},
+        "lossy": as_text(report.lossy),
         "findings": msgspec.json.encode(report.findings).decode(),
     }
     return records

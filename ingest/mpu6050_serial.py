@@ -80,14 +80,8 @@ def _blocks(
     clock = Clock(report, tick_ns=1_000_000, period=2**32)
     checks = {s: SensorCheck(report, f"/foot/imu{s}", AXES, limits=scale[s].limits()) for s in (1, 2)}
     wall = _WallClock()
-    for path in paths:
-        for rows in integer_rows(path, LIMITS, COLUMNS, report):
-            wall.feed(rows)
-            names = ("t", *COLUMNS[1:])
-            frame = pl.DataFrame([pl.Series(n, v) for n, v in zip(names, rows.values, strict=True)])
-            yield from _tables(clock.feed(frame.with_columns(line=pl.Series(rows.lines))), scale, checks)
-    empty = pl.DataFrame(schema=dict.fromkeys(("t", *COLUMNS[1:], "line"), pl.Int64))
-    yield from _tables(clock.feed(empty, final=True), scale, checks)
+    for frame in clock.stream(_frames(paths, report, wall)):
+        yield from _tables(frame, scale, checks)
     if not report.kept:
         raise MarchaError(
             f"{paths[0]}: no row of {len(COLUMNS)} whole numbers in it; is it the device's serial text?"
@@ -97,11 +91,17 @@ def _blocks(
     device.update(wall.metadata())
 
 
+def _frames(paths: Sequence[Path], report: ReportBuilder, wall: _WallClock) -> Iterator[pl.DataFrame]:
+    for path in paths:
+        for rows in integer_rows(path, LIMITS, COLUMNS, report):
+            wall.feed(rows)
+            series = zip(("t", *COLUMNS[1:]), rows.values, strict=True)
+            yield pl.DataFrame([*(pl.Series(n, v) for n, v in series), pl.Series("line", rows.lines)])
+
+
 def _tables(
     frame: pl.DataFrame, scale: dict[int, Scale], checks: dict[int, SensorCheck]
 ) -> Iterator[tuple[str, pl.DataFrame]]:
-    if not frame.height:
-        return
     lines = frame["line"].to_numpy()
     for sensor in (1, 2):
         counts = [frame[f"{a}{sensor}"].to_numpy() for a in ("ax", "ay", "az", "gx", "gy", "gz")]

@@ -157,13 +157,9 @@ class _File:
         places = [p for _, found in self._topics for _, _, p in found if p is not None]
         if self._time_at is not None:
             places.append(self._time_at)
-        empty: pl.DataFrame | None = None
-        for block in self._cells.rows(places, self._report):
-            frame = self._values(block)
-            empty = frame.clear()
-            yield from self._tables(self._clock.feed(frame))
-        if empty is not None:
-            yield from self._tables(self._clock.feed(empty, final=True))
+        frames = map(self._values, self._cells.rows(places, self._report))
+        for frame in self._clock.stream(frames):
+            yield from self._tables(frame)
         for check in self._checks.values():
             check.finish()
 
