@@ -78,10 +78,10 @@ def align(
     estimate, reference : ndarray, shape (n, 3)
         Matched positions in metres, n ≥ 1.
     kind : {"none", "origin", "origin-yaw", "se2", "se3"}
-        ``none``: coordinates as they are. ``origin``: first positions laid upon each other. ``origin-yaw``: that, and the
-        heading at the start, from the orientations given or else from the way of the first 2 m. ``se2``: least squares
-        over a turn about z and a translation. ``se3``: least squares over all rotations and a translation, without
-        scale (Horn 1987; Umeyama 1991).
+        ``none``: coordinates as they are. ``origin``: first positions laid upon each other. ``origin-yaw``:
+        that, and the heading at the start, from the orientations given or else from the way of the first 2 m.
+        ``se2``: least squares over a turn about z and a translation. ``se3``: least squares over all
+        rotations and a translation, without scale (Horn 1987; Umeyama 1991).
     estimate_yaw, reference_yaw : float, optional
         Headings at the start in radians, where both tracks have an orientation.
 
@@ -116,7 +116,7 @@ def align(
 
 
 def _start_headings(estimate: FloatArray, reference: FloatArray) -> tuple[float, float]:
-    """Return the headings of both tracks over the reference's first 2 m (its farthest point where it is shorter)."""
+    """Return the headings of both tracks over the reference's first 2 m (all the way where it is shorter)."""
     way = np.hypot(*(reference[:, :2] - reference[0, :2]).T)
     far = np.flatnonzero(way >= HEADING_M)
     k = int(far[0]) if far.size else int(np.argmax(way))
@@ -133,7 +133,8 @@ class Matches:
     index : ndarray of int64
         Stamps (of the track whose time is kept) that have a partner.
     left, weight : ndarray
-        The partner lies between samples ``left`` and ``left + 1`` of the other track, at ``weight`` in [0, 1].
+        The partner lies between samples ``left`` and ``left + 1`` of the other track, at ``weight`` in [0,
+        1].
     dropped : int
         Stamps without a partner.
     max_distance_s : float
@@ -168,8 +169,8 @@ def match(times_ns: IntArray, other_ns: IntArray, max_gap_s: float) -> Matches:
     other_ns : ndarray of int64, shape (m,)
         Stamps of the other track, strictly ascending.
     max_gap_s : float
-        Neighbouring samples farther apart are not interpolated between. A stamp that is equal to a sample's always
-        has it as its partner.
+        Neighbouring samples farther apart are not interpolated between. A stamp that is equal to a sample's
+        always has it as its partner.
 
     Returns
     -------

@@ -47,8 +47,8 @@ def replay(
     recording : Recording or Source
         As :func:`marcha.recording.open` gives it; or a :class:`LiveSource`.
     estimators : sequence
-        Names (``foot.9iez``, ``slow=foot.9iez[sigma_acc=0.01]``), or classes or instances of one's own. All run in
-        one pass.
+        Names (``foot.9iez``, ``slow=foot.9iez[sigma_acc=0.01]``), or classes or instances of one's own. All
+        run in one pass.
     params : mapping, optional
         Parameters for every estimator that has them; those in the brackets of a name win.
     inputs : sequence of str, optional
@@ -68,8 +68,8 @@ def replay(
     sinks : sequence of Sink
         Further observers: a viewer, a file, a test.
     keep_tables : bool
-        Keep the results in memory (``result.runs[i].tables``). Without it memory does not grow with the length,
-        and metrics are measured only where ``out`` is given (from there).
+        Keep the results in memory (``result.runs[i].tables``). Without it memory does not grow with the
+        length, and metrics are measured only where ``out`` is given (from there).
     clock : Clock, optional
         Paces the replay.
     progress : callable, optional

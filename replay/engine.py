@@ -25,7 +25,7 @@ Progress = Callable[[int, int], object]
 """Called with nanoseconds done and nanoseconds in all (0 where the end is not known)."""
 
 TICK_S = 0.02
-"""Longest sleep of a paced replay: how soon it notices a pause."""
+"""Beat of a paced replay: what became due since the last one goes through, and a pause is noticed."""
 
 
 @dataclass
@@ -120,7 +120,8 @@ class Engine:
     sinks : sequence of Sink
         Take raw messages and results.
     mode : {"block", "sample"}
-        ``block`` hands whole blocks to estimators that take them, ``sample`` steps sample by sample. Same bits.
+        ``block`` hands whole blocks to estimators that take them, ``sample`` steps sample by sample. Same
+        bits.
     speed : "max" or float
         Factor of real time.
     gap : GapPolicy
@@ -130,7 +131,8 @@ class Engine:
     start_ns, end_ns : int, optional
         Range of log times, half open.
     checkpoint_s : float or None
-        Keep the state about every so many seconds of the recording, to seek back to; None keeps only the start.
+        Keep the state about every so many seconds of the recording, to seek back to; None keeps only the
+        start.
     progress : callable, optional
         Called with nanoseconds done and in all.
 
@@ -336,10 +338,9 @@ class Engine:
             if last > self._cursor:
                 self._advance(merged, last)
                 continue
-            ahead = int(merged.log_ns[self._cursor])
-            if until_ns is not None and ahead >= until_ns:
+            if until_ns is not None and merged.log_ns[self._cursor] >= until_ns:
                 return False
-            self.clock.sleep(min(TICK_S, max(1e-9, (ahead - due) / speed / 1e9)))
+            self.clock.sleep(TICK_S)
         return False
 
     # -- messages ------------------------------------------------------------------------------------
@@ -379,9 +380,9 @@ class Engine:
         newest = int(merged.log_ns[last - 1])
         following = max(merged.batch.end_ns, newest + 1) if whole else int(merged.log_ns[last])
         self._position_ns = following
-        if following > newest and self._checkpoint_ns is not None and self.source.seekable:
-            if following >= self._checkpoints[-1].log_ns + self._checkpoint_ns:
-                self._checkpoints.append(self._checkpoint(following))
+        keep = following > newest and self._checkpoint_ns is not None and self.source.seekable
+        if keep and following >= self._checkpoints[-1].log_ns + (self._checkpoint_ns or 0):
+            self._checkpoints.append(self._checkpoint(following))
         if self._progress is not None:
             begin, end = self._begin_ns, self._end_ns if self._end_ns is not None else self.source.end_ns
             self._progress(min(newest, end) - begin if end > begin else newest, max(0, end - begin))

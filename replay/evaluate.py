@@ -121,8 +121,8 @@ def evaluate(
     max_gap_s : float
         Reference samples farther apart are not interpolated between.
     reference : str, optional
-        Topic of the reference track. Without it the one named like the run's input (``/reference/imu2/pose`` for
-        ``/foot/imu2``), else ``/reference/pose``, else the only pose below ``/reference/``.
+        Topic of the reference track. Without it the one named like the run's input (``/reference/imu2/pose``
+        for ``/foot/imu2``), else ``/reference/pose``, else the only pose below ``/reference/``.
     intervals : bool
         Whether annotated intervals are measured too.
 
@@ -311,7 +311,7 @@ def _intervals(annotations: pl.DataFrame) -> pl.DataFrame:
 
 
 def _reference_topic(rec: Recording, input_topic: str, chosen: str | None) -> str | None:
-    """Return the reference of an input: of ``/foot/imu2``, ``/reference/imu2/pose`` before ``/reference/pose``."""
+    """Return the reference: of ``/foot/imu2``, ``/reference/imu2/pose`` before ``/reference/pose``."""
     poses = [
         t
         for t, c in rec.channels.items()

@@ -27,8 +27,8 @@ class GapPolicy:
     ----------
     policy : {"bridge", "reset", "stop"}
         ``bridge`` feeds the next sample with its true time difference: the estimator integrates across.
-        ``reset`` starts the estimator anew after the gap, in a new segment. ``stop`` ends the run before the gap.
-        Every gap is a finding of the run, whatever the policy.
+        ``reset`` starts the estimator anew after the gap, in a new segment. ``stop`` ends the run before the
+        gap. Every gap is a finding of the run, whatever the policy.
     max_gap_s : float or None
         Longest interval in seconds that is no gap. None: 0.2 s or five sample intervals, whichever is longer.
     """
@@ -240,7 +240,7 @@ class Feed:
         if state.stopped:
             state.after_stop += len(times)
             return np.zeros(len(times), bool), np.empty(0), ()
-        finite = np.isfinite(values).all(axis=1)
+        finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
         state.missing.add(times[~finite])
         kept = finite
         known = times[finite]
@@ -292,8 +292,8 @@ class Feed:
             spoken = ~np.isnan(news).all(axis=1)
             news = news[spoken]
             target = np.searchsorted(places, part.positions[topic][spoken])
-        if state.pending[index] is not None:
-            news = np.vstack((state.pending[index], news))
+        if (waiting := state.pending[index]) is not None:
+            news = np.vstack((waiting, news))
             target = np.concatenate(([0], target))
         newest = np.diff(target, append=n + 1) > 0  # the last of all that wait for the same row
         state.superseded[index] += int((~newest).sum())
@@ -305,64 +305,40 @@ class Feed:
     def findings(self) -> list[Finding]:
         """Return what was not fed and what was uneven, one line a kind."""
         state, topic = self._state, self.inputs[0][0]
-        columns = " ".join(self.inputs[0][1])
-        found = []
-        if state.missing.count:
-            found.append(
-                Finding(
-                    "missing_value",
-                    state.missing.count,
-                    None,
-                    f"{topic}: {state.missing.count} messages without a finite value in each of {columns} were not fed, "
-                    f"first at t_ns {state.missing.first_ns}",
-                )
-            )
-        for kind, tally, rule in (
-            ("duplicate_time", state.duplicate, "the time of the message before"),
-            ("backwards_time", state.backwards, "a time before the message before"),
-        ):
+        found: list[Finding] = []
+
+        def say(kind: str, tally: Tally, detail: str) -> None:
             if tally.count:
-                found.append(
-                    Finding(
-                        kind,
-                        tally.count,
-                        None,
-                        f"{topic}: {tally.count} messages with {rule} were not fed, first at t_ns {tally.first_ns}",
-                    )
-                )
-        if state.gaps.count:
-            done = {
-                "bridge": "the estimator integrated across it (gap policy bridge)",
-                "reset": "the estimator started anew after it (gap policy reset)",
-                "stop": f"the run ended before it and {state.after_stop} messages were not fed (gap policy stop)",
-            }[self.gap.policy]
-            found.append(
-                Finding(
-                    "gap",
-                    state.gaps.count,
-                    None,
-                    f"{topic}: {state.gaps.count} intervals above {self.limit_s:g} s, the longest {state.gaps.largest:.3f} s, "
-                    f"first ends at t_ns {state.gaps.first_ns}: {done}",
-                )
-            )
-        if state.jitter.count:
-            found.append(
-                Finding(
-                    "jitter",
-                    state.jitter.count,
-                    None,
-                    f"{topic}: {state.jitter.count} intervals above {JITTER:g} times the usual {1e3 / self.rate_hz:.3g} ms, "
-                    f"the longest {1e3 * state.jitter.largest:.4g} ms: fed with their true time difference",
-                )
-            )
+                found.append(Finding(kind, tally.count, None, f"{topic}: {tally.count} {detail}"))
+
+        columns = " ".join(self.inputs[0][1])
+        for kind, tally, rule in (
+            ("missing_value", state.missing, f"without a finite value in each of {columns}"),
+            ("duplicate_time", state.duplicate, "with the time of the message before"),
+            ("backwards_time", state.backwards, "with a time before the message before"),
+        ):
+            say(kind, tally, f"messages {rule} were not fed, the first at t_ns {tally.first_ns}")
+        done = {
+            "bridge": "the estimator integrated across",
+            "reset": "the estimator started anew after each",
+            "stop": f"the run ended before it, {state.after_stop} messages were not fed",
+        }[self.gap.policy]
+        say(
+            "gap",
+            state.gaps,
+            f"intervals above {self.limit_s:g} s, the longest {state.gaps.largest:.3f} s, the first ends at "
+            f"t_ns {state.gaps.first_ns}: {done} (gap policy {self.gap.policy})",
+        )
+        say(
+            "jitter",
+            state.jitter,
+            f"intervals above {JITTER:g} usual ones ({1e3 / (self.rate_hz or np.inf):.4g} ms), the longest "
+            f"{1e3 * state.jitter.largest:.4g} ms: fed with their true time difference",
+        )
         for (other, _), count in zip(self.inputs[1:], state.superseded[1:], strict=True):
             if count:
-                found.append(
-                    Finding(
-                        "superseded",
-                        count,
-                        None,
-                        f"{other}: {count} messages were overtaken by a newer one before the next row of {topic}",
-                    )
+                detail = (
+                    f"{other}: {count} messages were overtaken by a newer one before the next row of {topic}"
                 )
+                found.append(Finding("superseded", count, None, detail))
         return found

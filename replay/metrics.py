@@ -1,4 +1,5 @@
-"""Figures of merit of one run. Each is a function ``metric(view) -> {name: value}``, an entry point ``marcha.metrics``.
+"""Figures of merit of one run. Each is a function ``metric(view) -> {name: value}``, an entry point
+``marcha.metrics``.
 
 Names carry their units. A metric that does not apply (no reference, length not known) leaves its names out; a
 metric that applies but has no value is NaN. ``docs/replay.md`` lists every name with its formula.
@@ -186,7 +187,7 @@ class RunView:
 
     @cached_property
     def comparison(self) -> Comparison | None:
-        """The estimate beside the reference under the view's alignment, None without a reference or a match."""
+        """The estimate beside the reference under the view's alignment; None where nothing matches."""
         return compare(self, self.alignment)
 
     @cached_property
@@ -321,8 +322,9 @@ def _velocity_error(view: RunView, transform: Transform) -> tuple[IntArray, Floa
 def consistency(view: RunView) -> dict[str, float]:
     """Whether the errors are as large as the filter says: normalized errors from its own standard deviations.
 
-    The track is laid upon the reference at the start (``origin-yaw``), as the filter itself begins with certainty
-    there; a fitted alignment would take part of the error away. Samples whose sigma is still 0 are left out.
+    The track is laid upon the reference at the start (``origin-yaw``), as the filter itself begins with
+    certainty there; a fitted alignment would take part of the error away. Samples whose sigma is still 0 are
+    left out.
     """
     sigma = view.table("sigma")
     compared = compare(view, "origin-yaw")
@@ -388,7 +390,7 @@ def available_metrics() -> dict[str, Metric]:
 
 @lru_cache(maxsize=8)
 def _metrics(scan: Callable[..., metadata.EntryPoints], path: tuple[str, ...]) -> dict[str, Metric]:
-    """Load the metrics. A scan of all that is installed takes 10 ms: one for each ``sys.path``, not one a run."""
+    """Load the metrics: a scan of what is installed takes 10 ms, so one a ``sys.path``, not one a run."""
     found: dict[str, Metric] = {}
     for entry in scan(group="marcha.metrics"):
         try:

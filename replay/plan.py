@@ -267,12 +267,13 @@ class _Maker:
     def _make(self, given: Mapping[str, Any]) -> Any:
         if self._instance is not None:
             return copy.deepcopy(self._instance)
+        cls: Any = self.cls
         try:
             if self._name is not None:
                 return make(self._name, **given)
             if not given:
-                return self.cls()
-            return self.cls(msgspec.convert(dict(given), self.cls.Params))
+                return cls()
+            return cls(msgspec.convert(dict(given), cls.Params))
         except (AlgorithmError, msgspec.ValidationError) as error:
             raise UsageError(str(error)) from None
 
@@ -284,7 +285,8 @@ class _Maker:
             if self._instance is None:
                 estimator = self._make({**self._given, "rate_hz": rate_hz})
             else:
-                estimator = self.cls(msgspec.structs.replace(params, rate_hz=rate_hz))
+                build: Any = self.cls
+                estimator = build(msgspec.structs.replace(params, rate_hz=rate_hz))
             params = estimator.params
         return estimator, msgspec.to_builtins(params) if isinstance(params, msgspec.Struct) else {}
 
@@ -309,8 +311,8 @@ def _attachments(
         if len(fitting) != len(alike):
             topics = ", ".join(c.topic for c in fitting)
             raise UsageError(
-                f"{source.name}: estimator {name} reads {len(alike)} channels of {wanted[0].schema} together, there are "
-                f"{len(fitting)} ({topics}); name them in order with --input"
+                f"{source.name}: estimator {name} reads {len(alike)} channels of {wanted[0].schema} "
+                f"together, there are {len(fitting)} ({topics}); name them in order with --input"
             )
         groups = [dict(zip(alike, fitting, strict=True))]
     else:
@@ -326,7 +328,7 @@ def _attachments(
                 notes += note
             if channel is not None and (lacking := [c for c in need.columns if c not in channel.columns]):
                 raise UsageError(
-                    f"{source.name}: {channel.topic} has no column {lacking[0]}, which estimator {name} reads; "
+                    f"{source.name}: {channel.topic} has no column {lacking[0]}, which {name} reads; "
                     f"it has {', '.join(channel.columns)}"
                 )
             channels.append(channel)
@@ -337,7 +339,7 @@ def _attachments(
 def _companion(
     need: Input, primary: PlannedChannel, source: Source, chosen: Sequence[str] | None, name: str
 ) -> tuple[PlannedChannel | None, list[Finding]]:
-    """Return the channel of a further input: named by the user, or the only one of its kind beside the first."""
+    """Return the channel of a further input: the one named, or the only one of its kind beside the first."""
     beside = primary.topic.rpartition("/")[0] + "/"
     fitting = [c for c in source.channels.values() if c.schema == need.schema and c.topic != primary.topic]
     named = [c for c in fitting if chosen and c.topic in chosen]
@@ -348,8 +350,8 @@ def _companion(
     topics = ", ".join(c.topic for c in candidates) or "none"
     if not need.optional:
         raise UsageError(
-            f"{source.name}: estimator {name} on {primary.topic} needs one channel of {need.schema} under {beside}; "
-            f"there are {topics}; name it with --input"
+            f"{source.name}: estimator {name} on {primary.topic} needs one channel of {need.schema} "
+            f"under {beside}; there are {topics}; name it with --input"
         )
     if not candidates:
         return None, []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import time
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -180,7 +181,8 @@ class Runner:
             times = state.recent_ns[len(state.recent_ns) - len(out) :]
         if out.shape != (len(times), len(self.columns)):
             raise MarchaError(
-                f"estimator {self.plan.name} returned {out.shape} at its end, expected ({len(times)}, {len(self.columns)})"
+                f"estimator {self.plan.name} returned {out.shape} at its end, "
+                f"expected ({len(times)}, {len(self.columns)})"
             )
         return self._tables(out, times, np.full(len(times), state.last_log_ns))
 
@@ -196,28 +198,17 @@ class Runner:
                 continue
             all_of_it = bool(spoken.all())
             pick = slice(None) if all_of_it else spoken
-            data = {"t_ns": t_ns[pick], "t_log_ns": t_log_ns[pick]}
+            data: dict[str, Any] = {"t_ns": t_ns[pick], "t_log_ns": t_log_ns[pick]}
             data |= {name: block[i][pick] for i, name in enumerate(output.columns)}
-            tables[output.name] = self._typed(output.name, pl.DataFrame(data))
+            if output.schema == "marcha_msgs/msg/Stance":
+                data["still"] = data["still"] > 0.5
+                self._note_stances(data["t_ns"], data["still"])
+            table = pl.DataFrame(data)
+            if output.schema == "marcha_msgs/msg/Step":
+                table = _with_swing_times(table)
+                self._note_steps(table)
+            tables[output.name] = table
         return tables
-
-    def _typed(self, name: str, table: pl.DataFrame) -> pl.DataFrame:
-        """Give a table the schema's types and take down stances and steps."""
-        schema = self.plan.outputs[name].schema
-        if schema == "marcha_msgs/msg/Stance":
-            table = table.with_columns(pl.col("still") > 0.5)
-            self._note_stances(table["t_ns"].to_numpy(), table["still"].to_numpy())
-        elif schema == "marcha_msgs/msg/Step":
-            swing_ns = (pl.col("swing_s") * 1e9).round().cast(pl.Int64)
-            table = table.select(
-                "t_ns",
-                "t_log_ns",
-                (pl.col("t_ns") - swing_ns).alias("start_ns"),
-                pl.col("t_ns").alias("end_ns"),
-                *(c for c in table.columns[2:] if c != "swing_s"),
-            ).with_columns(pl.col("index").cast(pl.UInt32))
-            self._note_steps(table)
-        return table
 
     # -- annotations ---------------------------------------------------------------------------------
 
@@ -254,7 +245,7 @@ class Runner:
         rows += [
             (f"{run}/step", a, b, f"step {v.get('index', i)}", v) for i, (a, b, v) in enumerate(self._steps)
         ]
-        return annotations(rows)
+        return annotation_frame(rows)
 
     # -- what to say -----------------------------------------------------------------------------------
 
@@ -274,7 +265,7 @@ class Runner:
                     "no_samples",
                     1,
                     None,
-                    f"{self.plan.input}: no message with a finite value in each of {columns}: nothing was computed",
+                    f"{self.plan.input}: no finite value in each of {columns}: nothing was computed",
                 )
             )
             fatal = True
@@ -293,13 +284,25 @@ ANNOTATION_SCHEMA = {
 }
 
 
-def annotations(rows: list[tuple[str, int, int, str, dict[str, str]]]) -> pl.DataFrame:
+def annotation_frame(rows: list[tuple[str, int, int, str, dict[str, str]]]) -> pl.DataFrame:
     """Return annotation rows as the table that :meth:`Writer.add_annotations` takes."""
-    import json
-
     return pl.DataFrame(
         [(*r[:4], json.dumps(r[4])) for r in rows], schema=ANNOTATION_SCHEMA, orient="row"
     ).sort("start_ns", maintain_order=True)
+
+
+def _with_swing_times(table: pl.DataFrame) -> pl.DataFrame:
+    """Turn the swing's length of a step, which ends at the row's time, into its two times."""
+    if "swing_s" not in table.columns:
+        return table
+    swing_ns = (pl.col("swing_s") * 1e9).round().cast(pl.Int64)
+    return table.select(
+        "t_ns",
+        "t_log_ns",
+        (pl.col("t_ns") - swing_ns).alias("start_ns"),
+        pl.col("t_ns").alias("end_ns"),
+        *(c for c in table.columns[2:] if c != "swing_s"),
+    ).with_columns(pl.col("index").cast(pl.UInt32))
 
 
 def _joined(tables: list[dict[str, pl.DataFrame]]) -> dict[str, pl.DataFrame]:

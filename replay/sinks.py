@@ -93,7 +93,8 @@ class RecordingSink:
     path : Path
         Recording to write; appears whole or not at all.
     recording : Recording or None
-        Input whose channels are copied verbatim; None for a live source, whose messages are written as they come.
+        Input whose channels are copied verbatim; None for a live source, whose messages are written as they
+        come.
     overwrite : bool
         Whether ``path`` may be replaced.
     """

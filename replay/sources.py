@@ -1,7 +1,8 @@
 """Where messages come from: a recording, or something live.
 
-A source hands over windows: for every topic a table with ``t_ns`` (the time a message speaks of), ``t_log_ns``
-(when it was known) and its columns. Windows are disjoint in log time, so whatever merges one window merges all.
+A source hands over windows: for every topic a table with ``t_ns`` (the time a message speaks of),
+``t_log_ns`` (when it was known) and its columns. Windows are disjoint in log time, so whatever merges one
+window merges all.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from ..recording import Recording
 
 RATE_ROWS = 20_000
-"""Intervals from which a channel's rate is measured: its first ones, so that a range or a seek changes nothing."""
+"""Rows from which a channel's rate is measured: its first ones, so that a range or a seek changes nothing."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Source(Protocol):
     """What the engine asks of a source."""
 
     name: str
-    channels: Mapping[str, PlannedChannel]
+    channels: dict[str, PlannedChannel]
     seekable: bool
     start_ns: int
     end_ns: int

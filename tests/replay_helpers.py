@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import polars as pl
-
 from marcha.algorithms import Input, Output, PlainEstimator
 from marcha.replay import Batch, Engine, PlannedChannel, ReplayResult, TableSink, plan_runs
 
@@ -23,7 +23,9 @@ def channel(topic: str, schema: str, columns: Sequence[str], **metadata: str) ->
     return PlannedChannel(topic, schema, "body", tuple(columns), metadata)
 
 
-def table(t_ns: Sequence[int], columns: Mapping[str, Any], t_log_ns: Sequence[int] | None = None) -> pl.DataFrame:
+def table(
+    t_ns: Sequence[int], columns: Mapping[str, Any], t_log_ns: Sequence[int] | None = None
+) -> pl.DataFrame:
     times = {"t_ns": t_ns, "t_log_ns": t_ns if t_log_ns is None else t_log_ns}
     return pl.DataFrame(times | dict(columns), schema_overrides={"t_ns": pl.Int64, "t_log_ns": pl.Int64})
 
@@ -34,7 +36,7 @@ def imu_table(n: int, seed: int = 0, start_ns: int = 10**18) -> pl.DataFrame:
 
 
 class MemorySource:
-    """A source of tables in memory, in batches of at least ``max_rows`` messages that are disjoint in log time."""
+    """Tables in memory, in batches of about ``max_rows`` messages that are disjoint in log time."""
 
     seekable = True
     name = "memory"
@@ -50,7 +52,9 @@ class MemorySource:
     def rate_hz(self, topic: str) -> float:
         return 1e9 / STEP_NS
 
-    def batches(self, topics: Sequence[str], start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Batch]:
+    def batches(
+        self, topics: Sequence[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Batch]:
         low = self.start_ns if start_ns is None else start_ns
         high = self.end_ns + 1 if end_ns is None else end_ns
         tables = {
@@ -60,8 +64,10 @@ class MemorySource:
         }
         logs = np.sort(np.concatenate([t["t_log_ns"].to_numpy() for t in tables.values()]))
         cuts = [low, *sorted({int(x) for x in logs[self.max_rows :: self.max_rows]}), high]
-        for a, b in zip(cuts[:-1], cuts[1:], strict=True):
-            part = {t: v.filter((pl.col("t_log_ns") >= a) & (pl.col("t_log_ns") < b)) for t, v in tables.items()}
+        for a, b in pairwise(cuts):
+            part = {
+                t: v.filter((pl.col("t_log_ns") >= a) & (pl.col("t_log_ns") < b)) for t, v in tables.items()
+            }
             part = {t: v for t, v in part.items() if v.height}
             if part:
                 self.batches_read += 1
@@ -84,7 +90,7 @@ class Echo(PlainEstimator):
 
 
 class Smoother(PlainEstimator):
-    """Recursive (its bits depend on every row and their order), late by ``latency`` rows, takes blocks too."""
+    """Recursive: its bits depend on every row and their order. Late by ``latency`` rows; takes blocks too."""
 
     name = "smoother"
 
@@ -121,12 +127,16 @@ class Smoother(PlainEstimator):
         return np.array(last).reshape(-1, 5)
 
 
-def engine_of(source: Any, estimators: Sequence[Any], sinks: Sequence[Any] = (), **options: Any) -> tuple[Engine, TableSink]:
+def engine_of(
+    source: Any, estimators: Sequence[Any], sinks: Sequence[Any] = (), **options: Any
+) -> tuple[Engine, TableSink]:
     tables = TableSink()
     return Engine(source, plan_runs(source, estimators), sinks=(tables, *sinks), **options), tables
 
 
-def run_all(source: Any, estimators: Sequence[Any], **options: Any) -> tuple[ReplayResult, dict[str, pl.DataFrame]]:
+def run_all(
+    source: Any, estimators: Sequence[Any], **options: Any
+) -> tuple[ReplayResult, dict[str, pl.DataFrame]]:
     engine, tables = engine_of(source, estimators, **options)
     engine.play()
     result = engine.finish()
@@ -158,9 +168,12 @@ def oracle_rows(
     """
     order = {topic: i for i, topic in enumerate(tables)}
     streams = [
-        [(log, order[topic], i, t, topic, values) for i, (t, log, *values) in enumerate(
-            tables[topic].select("t_ns", "t_log_ns", *columns[topic]).iter_rows()
-        )]
+        [
+            (log, order[topic], i, t, topic, values)
+            for i, (t, log, *values) in enumerate(
+                tables[topic].select("t_ns", "t_log_ns", *columns[topic]).iter_rows()
+            )
+        ]
         for topic in tables
     ]
     further = [t for t in tables if t != primary]

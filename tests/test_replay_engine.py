@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import given, settings, strategies as st
-
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from marcha.algorithms import Input, Output, PlainEstimator, Remark
 from marcha.recording import MarchaError, UsageError
 from marcha.replay import GapPolicy, ManualClock
@@ -55,7 +55,9 @@ def test_every_channel_of_the_kind_gets_a_run(expected: dict[str, pl.DataFrame])
 
 @pytest.mark.parametrize("max_rows", [1, 7, 100, 10**6])
 @pytest.mark.parametrize("mode", ["block", "sample"])
-def test_bits_do_not_depend_on_mode_and_batches(expected: dict[str, pl.DataFrame], mode: str, max_rows: int) -> None:
+def test_bits_do_not_depend_on_mode_and_batches(
+    expected: dict[str, pl.DataFrame], mode: str, max_rows: int
+) -> None:
     assert same_bits(run_all(two_feet(max_rows), ESTIMATORS, mode=mode)[1], expected)
 
 
@@ -77,7 +79,11 @@ def test_step_by_step_gives_the_same_bits(expected: dict[str, pl.DataFrame]) -> 
     while (message := engine.step()) is not None:
         taken.append(message)
     assert len(taken) == 2 * N
-    assert taken[:3] == [("/left/imu", START), ("/right/imu", START + 3_000_000), ("/left/imu", START + STEP_NS)]
+    assert taken[:3] == [
+        ("/left/imu", START),
+        ("/right/imu", START + 3_000_000),
+        ("/left/imu", START + STEP_NS),
+    ]
     assert same_bits(results_of(engine.finish(), tables), expected)
 
 
@@ -198,13 +204,13 @@ def test_messages_come_when_they_are_due(speed: float) -> None:
     log, wall = np.array(sink.came).T
     late = (wall - 5) - (log - START) / speed
     assert late.min() >= -1
-    assert late.max() <= 2  # nanoseconds: the clock moves exactly as slept
-    assert max(clock.slept) <= 0.02 + 1e-9
+    assert late.max() <= 20_000_000 + 2  # one beat
+    assert max(clock.slept) <= 0.02  # a pause is noticed soon
 
 
 def test_pause_from_a_sink_and_on() -> None:
     source, sink = two_feet(50), Watcher()
-    engine, tables = engine_of(source, [Echo()], [sink])
+    engine, _ = engine_of(source, [Echo()], [sink])
     sink.write = lambda topic, table: engine.pause()  # type: ignore[method-assign]
     assert not engine.play()
     first = engine.position_ns

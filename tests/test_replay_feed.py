@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 import pytest
-from hypothesis import given, settings, strategies as st
-
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from marcha.algorithms import Input
 from marcha.recording import UsageError
 from marcha.replay import GapPolicy
@@ -43,7 +43,9 @@ def echoed(result: dict[str, pl.DataFrame]) -> list[tuple[int, int, list[float]]
 
 @settings(max_examples=150)
 @given(imu=messages(ACC), mag=messages(MAG_COLUMNS), mag_first=st.booleans(), max_rows=st.integers(1, 40))
-def test_rows_equal_a_plain_event_loop(imu: pl.DataFrame, mag: pl.DataFrame, mag_first: bool, max_rows: int) -> None:
+def test_rows_equal_a_plain_event_loop(
+    imu: pl.DataFrame, mag: pl.DataFrame, mag_first: bool, max_rows: int
+) -> None:
     pairs = [(IMU_CHANNEL, imu), (MAG_CHANNEL, mag)]
     source = MemorySource(pairs[::-1] if mag_first else pairs, max_rows)
     result, tables = run_all(source, [Echo(further=[Input(MAG, MAG_COLUMNS)])], gap=GapPolicy(max_gap_s=1.0))
@@ -77,7 +79,9 @@ def test_merged_order_is_stable() -> None:
 def test_the_message_is_joined_once_it_is_known_not_when_it_was_measured() -> None:
     imu = table([0, STEP_NS, 2 * STEP_NS], {c: [1.0] * 3 for c in ACC})
     late = table([0], {c: [7.0] for c in MAG_COLUMNS}, t_log_ns=[STEP_NS + 1])
-    _, result = run_all(MemorySource([(IMU_CHANNEL, imu), (MAG_CHANNEL, late)]), [Echo(further=[Input(MAG, MAG_COLUMNS)])])
+    _, result = run_all(
+        MemorySource([(IMU_CHANNEL, imu), (MAG_CHANNEL, late)]), [Echo(further=[Input(MAG, MAG_COLUMNS)])]
+    )
     column = [row[-1] for _, _, row in echoed(result)]
     assert np.isnan(column[0])
     assert np.isnan(column[1])
@@ -86,7 +90,9 @@ def test_the_message_is_joined_once_it_is_known_not_when_it_was_measured() -> No
 
 def gappy(*intervals_ms: int) -> MemorySource:
     t = np.cumsum([0, *intervals_ms]) * MS
-    return MemorySource([(IMU_CHANNEL, table(t.tolist(), {c: np.arange(1.0, len(t) + 1) for c in ACC}))], max_rows=2)
+    return MemorySource(
+        [(IMU_CHANNEL, table(t.tolist(), {c: np.arange(1.0, len(t) + 1) for c in ACC}))], max_rows=2
+    )
 
 
 def test_bridge_feeds_the_true_time_difference() -> None:

@@ -7,11 +7,21 @@ from collections.abc import Iterator
 
 import polars as pl
 import pytest
-
 from marcha.recording import MarchaError, UsageError
 from marcha.replay import LiveSource, PlannedChannel
 
-from .replay_helpers import ACC, IMU, Echo, MemorySource, Smoother, channel, engine_of, imu_table, run_all, same_bits
+from .replay_helpers import (
+    ACC,
+    IMU,
+    Echo,
+    MemorySource,
+    Smoother,
+    channel,
+    engine_of,
+    imu_table,
+    run_all,
+    same_bits,
+)
 
 LEFT = channel("/left/imu", IMU, ACC, rate_hz="100")
 RIGHT = channel("/right/imu", IMU, ACC, rate_hz="100")

@@ -7,7 +7,6 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 import pytest
-
 from marcha.algorithms import Input, Output, PlainEstimator
 from marcha.recording import UsageError
 from marcha.replay import EstimatorSpec, parse_estimator, plan_runs
@@ -36,7 +35,10 @@ def two_imus() -> MemorySource:
         ("foot.9iez[]", EstimatorSpec("foot.9iez")),
         ("foot.9iez[sigma_acc=0.01]", EstimatorSpec("foot.9iez", {"sigma_acc": 0.01})),
         ("slow=foot.9iez[a=1, b=true]", EstimatorSpec("foot.9iez", {"a": 1, "b": True}, "slow")),
-        ("x[list=[1,2],word=shoe,none=null]", EstimatorSpec("x", {"list": [1, 2], "word": "shoe", "none": None})),
+        (
+            "x[list=[1,2],word=shoe,none=null]",
+            EstimatorSpec("x", {"list": [1, 2], "word": "shoe", "none": None}),
+        ),
         ('x[text="a,b"]', EstimatorSpec("x", {"text": "a,b"})),
         ("my-label=x", EstimatorSpec("x", {}, "my-label")),
     ],
@@ -114,7 +116,9 @@ def test_a_rate_that_is_set_stays() -> None:
 
 
 def test_a_registered_name_takes_brackets_over_common_parameters() -> None:
-    imu = MemorySource([(channel("/foot/imu", IMU, (*ACC, *GYR)), imu_table(3).with_columns(**dict.fromkeys(GYR, 0.0)))])
+    imu = MemorySource(
+        [(channel("/foot/imu", IMU, (*ACC, *GYR)), imu_table(3).with_columns(**dict.fromkeys(GYR, 0.0)))]
+    )
     runs = plan_runs(imu, ["foot.9iez", "loud=foot.9iez[sigma_acc=0.5]"], {"sigma_acc": 0.2})
     assert [r.params["sigma_acc"] for r in runs] == [0.2, 0.5]
     assert [r.run for r in runs] == ["foot_9iez_foot_imu", "loud_foot_imu"]
@@ -165,7 +169,10 @@ NEEDS_MAG = Echo(further=[Input(MAG, MAG_COLUMNS)])
 
 def test_a_further_input_is_the_one_beside_the_first() -> None:
     feet = source(
-        ("/left/imu", IMU, ACC), ("/left/mag", MAG, MAG_COLUMNS), ("/right/imu", IMU, ACC), ("/right/mag", MAG, MAG_COLUMNS)
+        ("/left/imu", IMU, ACC),
+        ("/left/mag", MAG, MAG_COLUMNS),
+        ("/right/imu", IMU, ACC),
+        ("/right/mag", MAG, MAG_COLUMNS),
     )
     assert [[t for t, _ in r.inputs] for r in plan_runs(feet, [NEEDS_MAG])] == [
         ["/left/imu", "/left/mag"],

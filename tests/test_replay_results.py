@@ -8,11 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import marcha.recording as mr
 import numpy as np
 import polars as pl
 import pytest
-
-import marcha.recording as mr
 from marcha.ingest.simulate import walk
 from marcha.recording import MarchaError, OutputExists, Recording, UsageError
 from marcha.replay import (
@@ -43,6 +42,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated closed walk of two sensors with its truth and an annotated task."""
     target = tmp_path_factory.mktemp("walk") / "walk.mcap"
     with mr.create(target) as out:
+        times = walk("rectangle", seed=5).t_ns
         for sensor in (1, 2):
             w = walk("rectangle", seed=5, sensor=sensor)
             acc, gyr = w.measured()
@@ -52,8 +52,9 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 truth = pl.DataFrame({"t_ns": w.t_ns} | columns(POSE, np.hstack((w.pos, w.quat_wxyz))))
                 out.add_table("/reference/pose", "geometry_msgs/msg/PoseStamped", truth, frame_id="nav")
                 speed = pl.DataFrame({"t_ns": w.t_ns} | columns(VEL, w.vel))
-                out.add_table("/reference/velocity", "geometry_msgs/msg/Vector3Stamped", speed, frame_id="nav")
-                times = w.t_ns
+                out.add_table(
+                    "/reference/velocity", "geometry_msgs/msg/Vector3Stamped", speed, frame_id="nav"
+                )
         out.add_metadata("truth", {"closed": "true", "length_m": "22.1"})
         task = {"tier": ["task"], "start_ns": [times[500]], "end_ns": [times[1500]], "label": ["first half"]}
         out.add_annotations(pl.DataFrame(task))
@@ -89,7 +90,10 @@ def test_estimates_in_the_file_are_those_in_memory(done: tuple[Any, Recording]) 
 def test_a_detector_that_looks_ahead_is_logged_late(done: tuple[Any, Recording]) -> None:
     result, rec = done
     latency = int(result.runs[0].lineage["latency"])
-    imu, pose = rec.table("/foot/imu1")["t_ns"], rec.table("/estimate/foot_9iez_foot_imu1/pose", log_time=True)
+    imu, pose = (
+        rec.table("/foot/imu1")["t_ns"],
+        rec.table("/estimate/foot_9iez_foot_imu1/pose", log_time=True),
+    )
     first = int(imu.search_sorted(pose["t_ns"][0]))
     assert latency > 0
     assert pose["t_log_ns"][0] == imu[first + latency]
@@ -154,7 +158,9 @@ def test_annotated_intervals_are_measured_and_own_tiers_are_not(done: tuple[Any,
     assert 0 < part.metrics["distance_m"] < 22
 
 
-def test_metrics_in_memory_equal_those_of_the_file(path: Path, done: tuple[Any, Recording], tmp_path: Path) -> None:
+def test_metrics_in_memory_equal_those_of_the_file(
+    path: Path, done: tuple[Any, Recording], tmp_path: Path
+) -> None:
     result, rec = done
     from_file = {r.run: r.metrics for r in evaluate(rec).runs}
     assert {r.run: r.metrics for r in result.runs} == {
@@ -193,7 +199,9 @@ def test_kernels_give_the_same_bits_live(path: Path, done: tuple[Any, Recording]
     rec = mr.open(path)
     rate = f"{RecordingSource(rec).rate_hz('/foot/imu1')!r}"
     imus = [channel(f"/foot/imu{i}", IMU, (*ACC, *GYR), rate_hz=rate) for i in (1, 2)]
-    messages = ((m.topic, m.t_ns, list(m.values.values())) for m in rec.messages(["/foot/imu1", "/foot/imu2"]))
+    messages = (
+        (m.topic, m.t_ns, list(m.values.values())) for m in rec.messages(["/foot/imu1", "/foot/imu2"])
+    )
     live = replay(LiveSource(imus, messages), ["foot.9iez"])
     wanted = {t: v for t, v in tables(done[0]).items() if t.startswith("/estimate/foot_9iez")}
     assert same_bits(tables(live), wanted)
@@ -288,7 +296,9 @@ def test_estimates_of_other_programs_are_measured(path: Path, tmp_path: Path) ->
     rec = mr.open(path)
     with mr.create(tmp_path / "foreign.mcap") as out:
         out.copy_from(rec)
-        out.add_table("/estimate/theirs/pose", "geometry_msgs/msg/PoseStamped", rec.table("/reference/pose"), "nav")
+        out.add_table(
+            "/estimate/theirs/pose", "geometry_msgs/msg/PoseStamped", rec.table("/reference/pose"), "nav"
+        )
     (run,) = evaluate(mr.open(tmp_path / "foreign.mcap")).runs
     assert run.run == "theirs"
     assert run.metrics["ate_rmse_m"] == pytest.approx(0.0, abs=1e-9)
@@ -296,7 +306,11 @@ def test_estimates_of_other_programs_are_measured(path: Path, tmp_path: Path) ->
 
 @pytest.mark.parametrize(
     ("options", "said"),
-    [({"runs": ["none"]}, "no run none"), ({"alignment": "best"}, "se3"), ({"reference": "/x"}, "/reference/pose")],
+    [
+        ({"runs": ["none"]}, "no run none"),
+        ({"alignment": "best"}, "se3"),
+        ({"reference": "/x"}, "/reference/pose"),
+    ],
 )
 def test_evaluate_refuses(done: tuple[Any, Recording], options: Mapping[str, Any], said: str) -> None:
     with pytest.raises(UsageError, match=said):
