@@ -10,7 +10,6 @@ from .errors import DEFECTS, DONE
 from .options import DEFAULT, Common
 
 if TYPE_CHECKING:
-    from ..ingest.contract import Report
     from ..recording import Recording
 
 
@@ -120,27 +119,28 @@ def check(path: Path, /, *, common: Common = DEFAULT) -> Outcome:
 
     rec = recording.open(path)
     found = [finding_entry(f) for f in examine(rec)]
-    report = import_report(rec)
-    imported = [finding_entry(f) for f in report.findings] if report else []
+    imported, lossy = import_report(rec)
     lines: list[Heading | Table] = [Heading(f"{path}: {'nothing is wrong' if not found else 'look at this'}")]
     if found:
         lines.append(finding_table(found))
     if imported:
         lines += [Heading("\nwhat the import found in the raw log"), finding_table(imported)]
     document = {"path": str(path), "findings": found, "import_findings": imported}
-    return Outcome(document, lines, DEFECTS if found or (report and report.lossy) else DONE)
+    return Outcome(document, lines, DEFECTS if found or lossy else DONE)
 
 
-def import_report(rec: Recording) -> Report | None:
-    """Return what the import of a recording counted and found; None where no such record is in it."""
+def import_report(rec: Recording) -> tuple[list[dict[str, Any]], bool]:
+    """Return what the import of a recording found, and whether data was lost or repaired.
+
+    Nothing and false where the recording was not imported by marcha.
+    """
     import msgspec
 
-    from ..ingest.contract import Report
     from ..recording.errors import Finding
 
-    record = dict(rec.metadata.get("import_report", {}))
+    record = rec.metadata.get("import_report", {})
     try:
-        findings = msgspec.json.decode(record.pop("findings"), type=list[Finding])
-        return msgspec.convert({**record, "findings": findings}, Report, strict=False)
-    except (KeyError, msgspec.MsgspecError):
-        return None
+        found = msgspec.json.decode(record.get("findings", "[]"), type=list[Finding])
+    except msgspec.MsgspecError:  # another program's record of this name
+        return [], False
+    return [finding_entry(f) for f in found], record.get("lossy") == "true"
