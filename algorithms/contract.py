@@ -12,10 +12,11 @@ The row
 
 The result
     one float64 vector in the order of ``outputs`` (all columns of all outputs, one after another), or None
-    where there is nothing to say yet. With ``latency`` L, the result of call k speaks of row k − L; the first L calls
-    return None, and ``flush`` returns the last L results. So a detector may look ahead, and replay stays causal: the
-    engine stamps a result with the time that it speaks of and logs it at the time when it was known.
-    A column that has no value is NaN. An output marked ``event`` exists only where its first column is not NaN.
+    where there is nothing to say yet. With ``latency`` L, the result of call k speaks of row k − L; the
+    first L calls return None, and ``flush`` returns the last L results. So a detector may look ahead, and
+    replay stays causal: the engine stamps a result with the time that it speaks of and logs it at the time
+    when it was known. A column that has no value is NaN. An output marked ``event`` exists only where its
+    first column is not NaN.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ class Estimator(Protocol):
     may be class attributes or set in ``__init__``. Everything else has a default in :class:`PlainEstimator`.
     """
 
-    name: str
+    name: ClassVar[str]
     inputs: tuple[Input, ...]
     outputs: tuple[Output, ...]
 
@@ -175,9 +176,9 @@ class KernelEstimator(PlainEstimator):
 
     A subclass sets ``kernel(state, row, out) -> bool`` and ``run(state, rows, out) -> int``, both
     module-level ``@njit(cache=True, nogil=True)`` functions of its module wrapped in ``staticmethod``, and
-    ``flush_kernel(state, out) -> int`` where ``latency`` is not 0, and builds ``self.state`` in ``__init__``. ``kernel`` returns whether ``out`` was filled;
-    ``run`` fills ``out[i]`` from ``rows[i]`` (a row without a result is NaN throughout) and returns the number of results.
-    Both give equal bits.
+    ``flush_kernel(state, out) -> int`` where ``latency`` is not 0, and builds ``self.state`` in
+    ``__init__``. ``kernel`` returns whether ``out`` was filled; ``run`` fills ``out[i]`` from ``rows[i]`` (a
+    row without a result is NaN throughout) and returns the number of results. Both give equal bits.
     """
 
     kernel: ClassVar[Callable[..., Any]]

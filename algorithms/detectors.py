@@ -1,31 +1,34 @@
 """Streaming zero-velocity detectors over the packed state of a foot estimator.
 
-Every detector turns a window of samples into one to three statistics and a raw decision, and the decisions are then
-cleaned. Windows are ``centred`` on the sample that they speak of or ``trailing`` (only its past); at both ends of the
-data they are cut off. What a detector must look ahead is its latency: half a centred window plus the look-ahead of the
-cleaning. The estimator holds its samples back by as much, so the decision about sample k meets sample k.
+Every detector turns a window of samples into one to three statistics and a raw decision, and the decisions
+are then cleaned. Windows are ``centred`` on the sample that they speak of or ``trailing`` (only its past);
+at both ends of the data they are cut off. What a detector must look ahead is its latency: half a centred
+window plus the look-ahead of the cleaning. The estimator holds its samples back by as much, so the decision
+about sample k meets sample k.
 
-===========  ==========================================================  =======================================
-detector     statistics (columns of the output ``detector``)             still where
-===========  ==========================================================  =======================================
-``c1c2c3``   ``acc_norm`` m/s², ``acc_var`` m²/s⁴, ``gyr_norm`` rad/s    c1_min < ‖f‖ < c1_max and
-                                                                         var ‖f‖ < c2_max and ‖ω‖ < c3_max
-``pitch``    ``pitch_dev`` deg, ``pitch_var`` deg²                       both below their limits
-``shoe``     ``shoe``: mean of ‖f − g f̄/‖f̄‖‖²/σa² + ‖ω‖²/σω²          below shoe_max
-``are``      ``are``: mean of ‖ω‖², rad²/s²                              below are_max
-``mv``       ``mv``: mean of ‖f − f̄‖², m²/s⁴                            below mv_max
-``mag``      ``mag``: mean of (‖f‖ − g)², m²/s⁴                          below mag_max
-===========  ==========================================================  =======================================
+==========  ==================================================  =============================================
+detector    statistics (columns of the output ``detector``)     still where
+==========  ==================================================  =============================================
+``c1c2c3``  ``acc_norm`` m/s², ``acc_var`` m²/s⁴,               c1_min < ‖f‖ < c1_max, var ‖f‖ < c2_max and
+            ``gyr_norm`` rad/s                                  ‖ω‖ < c3_max
+``pitch``   ``pitch_dev`` deg, ``pitch_var`` deg²               both below their limits
+``shoe``    ``shoe``: mean ‖f − g f̄/‖f̄‖‖²/σa² + ‖ω‖²/σω²       below shoe_max
+``are``     ``are``: mean ‖ω‖², rad²/s²                         below are_max
+``mv``      ``mv``: mean ‖f − f̄‖², m²/s⁴                        below mv_max
+``mag``     ``mag``: mean (‖f‖ − g)², m²/s⁴                     below mag_max
+==========  ==================================================  =============================================
 
-Sources: c1c2c3 and pitch from the foot-navigation dissertation (sections 4.4 and 4.4.1; after Jiménez et al. 2010);
-shoe, are, mv, mag from Skog, Händel, Nilsson, Rantakokko (2010), "Zero-velocity detection - an algorithm evaluation",
-with the settings of their program (σa = 0.01 m/s², σω = 0.1 °/s, γ = 0.3·10⁵), written here in physical units:
-γσω² = 0.0914 rad²/s², γσa² = 3 m²/s⁴. Every length is in seconds and becomes ``round(length · rate)`` samples.
+Sources: c1c2c3 and pitch from the foot-navigation dissertation (sections 4.4 and 4.4.1; after Jiménez et al.
+2010); shoe, are, mv, mag from Skog, Händel, Nilsson, Rantakokko (2010), "Zero-velocity detection - an
+algorithm evaluation", with the settings of their program (σa = 0.01 m/s², σω = 0.1 °/s, γ = 0.3·10⁵),
+written here in physical units: γσω² = 0.0914 rad²/s², γσa² = 3 m²/s⁴. Every length is in seconds and becomes
+``round(length · rate)`` samples.
 
 Cleaning, over ``cleaning_s`` (the source: 10 samples at 100 Hz):
 ``median`` takes the majority of the window, a tie is moving;
-``fill-burst`` fills gaps between two still stretches that are shorter than the window, then removes still stretches
-shorter than it (the authors' program; needs twice the window as look-ahead); ``none`` leaves the raw decision.
+``fill-burst`` fills gaps between two still stretches that are shorter than the window, then removes still
+stretches shorter than it (the authors' program; needs twice the window as look-ahead); ``none`` leaves the
+raw decision.
 """
 
 from __future__ import annotations
@@ -110,8 +113,9 @@ def _pitch(s: FloatArray) -> float:
 def track_tilt(s: FloatArray, r: int) -> None:
     """Carry the gravity direction on by the angular rate of the sample at ``r``, and write its pitch (deg).
 
-    The direction turns against the sensor (ġ = −ω × g, by Cayley's rotation) and is pulled towards the accelerometer
-    with the time constant ``pitch_tau_s`` while C1 and C3 hold, so that the gyroscope's residual bias cannot pile up.
+    The direction turns against the sensor (ġ = −ω × g, by Cayley's rotation) and is pulled towards the
+    accelerometer with the time constant ``pitch_tau_s`` while C1 and C3 hold, so that the gyroscope's
+    residual bias cannot pile up.
     """
     dt = s[r + R_DT]
     a = -0.5 * dt * (s[r + R_GYR] - s[INIT_MEAN + 3])
@@ -272,7 +276,8 @@ def _keep(s: FloatArray, j: int, last: int) -> None:
 
 @njit(cache=True, nogil=True)
 def decide(s: FloatArray, k: int, last: int) -> None:
-    """Advance every stage as far as sample ``k`` allows; past the end (``k > last``) windows are cut off there.
+    """Advance every stage as far as sample ``k`` allows; past the end (``k > last``) windows are cut off
+    there.
 
     Afterwards the decision of sample ``k − latency`` stands in its record.
     """

@@ -1,8 +1,8 @@
-"""What all foot-mounted estimators share: parameters, the way of a sample through the packed state, results, remarks.
+"""What all foot-mounted estimators share: parameters, a sample's way through the state, results, remarks.
 
-A row is taken (:func:`take`) into the ring, watched for the rest at the start, and judged by the detector; once the
-decision about sample k − latency is there, :func:`release` hands that sample to the filter, which ends with
-:func:`emit`. A filter's kernel is therefore four lines; see ``foot_9iez.py``.
+A row is taken (:func:`take`) into the ring, watched for the rest at the start, and judged by the detector;
+once the decision about sample k − latency is there, :func:`release` hands that sample to the filter, which
+ends with :func:`emit`. A filter's kernel is therefore four lines; see ``foot_9iez.py``.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class DetectorParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     cleaning: Annotated[
         Literal["median", "fill-burst", "none"],
         meta(
-            "Cleaning of the raw decisions: majority; or fill short gaps, then drop short bursts (authors' program)",
+            "Cleaning of the raw decisions: majority, or fill short gaps and then drop short bursts",
             source=_SOURCE,
         ),
     ] = "median"
@@ -256,7 +256,7 @@ def take(s: FloatArray, row: FloatArray) -> bool:
 
 @njit(cache=True, nogil=True)
 def take_end(s: FloatArray) -> bool:
-    """After the last row: decide about the next sample held back with windows cut off; False where none is left."""
+    """After the last row: decide about the next sample held back, windows cut off; False if none is left."""
     last = int(s[TAKEN]) - 1
     j = int(s[RELEASED])
     if j > last:
@@ -270,7 +270,7 @@ def take_end(s: FloatArray) -> bool:
 
 @njit(cache=True, nogil=True)
 def release(s: FloatArray) -> int:
-    """Return the record of the sample that is the filter's now, and start at the sample that completed the rest."""
+    """Count the next sample as released and return its record."""
     j = int(s[RELEASED])
     s[RELEASED] = j + 1
     r = record(s, j)
@@ -316,7 +316,7 @@ def emit(s: FloatArray, r: int, out: FloatArray) -> None:
 
 @njit(cache=True, nogil=True)
 def _land(s: FloatArray, out: FloatArray) -> None:
-    """At the first still sample after a swing: a step from the previous landing to here, if it is long enough."""
+    """At the first still sample after a swing: write the step from the previous landing, if long enough."""
     x, y, z = s[POS] - s[STEP_LAND], s[POS + 1] - s[STEP_LAND + 1], s[POS + 2] - s[STEP_LAND + 2]
     if s[STEP_SWING] < s[STEP_MIN_S] or math.sqrt(x * x + y * y + z * z) < s[STEP_MIN_M]:
         return
@@ -332,7 +332,7 @@ def _land(s: FloatArray, out: FloatArray) -> None:
 
 @njit(cache=True, nogil=True)
 def emit_sigma(s: FloatArray, p: int, n: int, pos: int, vel: int, att: int, out: FloatArray) -> None:
-    """Write the standard deviations of position, velocity and attitude from the n×n covariance at ``s[p]``."""
+    """Write the standard deviations of position, velocity and attitude from the covariance at ``s[p]``."""
     for i in range(3):
         if s[STARTED] > 0.5:
             out[O_REST + i] = math.sqrt(max(0.0, s[p + (pos + i) * (n + 1)]))
@@ -346,15 +346,17 @@ def emit_sigma(s: FloatArray, p: int, n: int, pos: int, vel: int, att: int, out:
 
 @njit(cache=True, nogil=True)
 def emit_detector(s: FloatArray, r: int, first: int, out: FloatArray) -> None:
-    """Write the detector's statistics of the sample at ``r`` to the end of the result, from ``out[first]`` on."""
+    """Write the detector's statistics of the sample at ``r`` to the end of the result."""
     for i in range(out.shape[0] - first):
         out[first + i] = s[r + R_STAT + i]
 
 
 @njit(cache=True, nogil=True)
 def at_rest(s: FloatArray, r: int, since: float, rate: float) -> bool:
-    """Return whether the foot has been still for ``since`` s and turns by less than ``rate`` rad/s at ``r``: the
-    condition of a zero angular rate update, stricter than stance, for a walking foot rolls on while it stands.
+    """Return whether the foot has been still for ``since`` s and turns by less than ``rate`` rad/s at ``r``.
+
+    The condition of a zero angular rate update; stricter than stance, for a walking foot rolls on as it
+    stands.
     """
     x = s[r + R_GYR] - s[BIAS_GYR]
     y = s[r + R_GYR + 1] - s[BIAS_GYR + 1]
@@ -373,8 +375,8 @@ SIGMA = Output(
 class FootEstimator(KernelEstimator):
     """Base of the foot estimators: builds the packed state, names the outputs, makes the remarks.
 
-    A subclass sets ``kernel``, ``run``, ``flush_kernel``, ``state_size`` (end of its own numbers in the state),
-    ``has_sigma``, ``Params`` and fills its own numbers in :meth:`configure`.
+    A subclass sets ``kernel``, ``run``, ``flush_kernel``, ``state_size`` (end of its own numbers in the
+    state), ``has_sigma``, ``Params`` and fills its own numbers in :meth:`configure`.
     """
 
     Params: ClassVar[type[msgspec.Struct]] = FootParams
@@ -432,7 +434,7 @@ class FootEstimator(KernelEstimator):
 
 
 def thresholds(p: Any) -> tuple[tuple[str, str], ...]:
-    """Return the limits of the chosen detector as channel metadata: ``threshold.<statistic>`` (``.min`` for a floor)."""
+    """Return the detector's limits as channel metadata: ``threshold.<statistic>``, ``.min`` for a floor."""
     limits = {
         "c1c2c3": {"acc_norm.min": p.c1_min, "acc_norm": p.c1_max, "acc_var": p.c2_max, "gyr_norm": p.c3_max},
         "pitch": {"pitch_dev": p.pitch_dev_max_deg, "pitch_var": p.pitch_var_max_deg2},
@@ -501,7 +503,8 @@ def _remarks(s: FloatArray, p: Any, rate_hz: float) -> list[Remark]:
         found.append(
             Remark(
                 "not_finite",
-                f"{int(s[REPAIRED])} of {taken} rows held a value that is not finite; the previous one was kept",
+                f"{int(s[REPAIRED])} of {taken} rows held a value that is not finite; the previous one "
+                f"was kept",
                 fatal=share > 0.01,
             )
         )
@@ -522,16 +525,18 @@ def _remarks(s: FloatArray, p: Any, rate_hz: float) -> list[Remark]:
             found.append(
                 Remark(
                     "rate_mismatch",
-                    f"windows were laid out for {rate_hz:g} Hz but rows come at {measured:.1f} Hz, so they last "
-                    f"{rate_hz / measured:.2f} times as long as asked; give rate_hz={measured:.0f}",
+                    f"windows were laid out for {rate_hz:g} Hz but rows come at {measured:.1f} Hz, so they "
+                    f"last {rate_hz / measured:.2f} times as long as asked; give rate_hz={measured:.0f}",
                 )
             )
     if s[INIT_INDEX] < 0:
         found.append(
             Remark(
                 "no_rest",
-                f"no rest of {p.init_s:g} s anywhere in {elapsed:.1f} s (longest {s[la.REST_BEST]:.2f} s): bias and "
-                "level are unknown, nothing was estimated; stand still at the start, or give a shorter init_s",
+                f"no rest of {p.init_s:g} s anywhere in {elapsed:.1f} s (longest {s[la.REST_BEST]:.2f} "
+                f"s): bias and "
+                "level are unknown, nothing was estimated; stand still at the start, or give a shorter "
+                "init_s",
                 fatal=True,
             )
         )
@@ -541,8 +546,10 @@ def _remarks(s: FloatArray, p: Any, rate_hz: float) -> list[Remark]:
         found.append(
             Remark(
                 "no_rest",
-                f"no rest of {p.init_s:g} s at the start; the first one begins at {start:.2f} s, and the estimate starts "
-                f"at its end, after {100 * (s[INIT_INDEX] + 1) / taken:.0f} % of the rows; a shorter init_s may find one "
+                f"no rest of {p.init_s:g} s at the start; the first one begins at {start:.2f} s, and the "
+                f"estimate starts "
+                f"at its end, after {100 * (s[INIT_INDEX] + 1) / taken:.0f} % of the rows; a shorter "
+                f"init_s may find one "
                 "earlier",
             )
         )
@@ -551,8 +558,10 @@ def _remarks(s: FloatArray, p: Any, rate_hz: float) -> list[Remark]:
         found.append(
             Remark(
                 "restless",
-                f"in the rest at {start:.2f} s the angular rate spreads by {spread:.3f} rad/s (a sensor that lies still: "
-                f"below {RESTLESS:g}): the bias taken from it is uncertain; hold still longer, or give a shorter init_s",
+                f"in the rest at {start:.2f} s the angular rate spreads by {spread:.3f} rad/s (a sensor "
+                f"that lies still: "
+                f"below {RESTLESS:g}): the bias taken from it is uncertain; hold still longer, or give a "
+                f"shorter init_s",
             )
         )
     ax, ay, az = s[la.INIT_MEAN : la.INIT_MEAN + 3]
@@ -569,7 +578,8 @@ def _remarks(s: FloatArray, p: Any, rate_hz: float) -> list[Remark]:
         found.append(
             Remark(
                 "gravity_norm",
-                f"‖f‖ at rest is {norm:.3f} m/s², {100 * (norm / p.gravity - 1):+.1f} % off gravity {p.gravity:g}: "
+                f"‖f‖ at rest is {norm:.3f} m/s², {100 * (norm / p.gravity - 1):+.1f} % off gravity "
+                f"{p.gravity:g}: "
                 "the accelerometer's scale or bias is off; calibrate it, or try gravity_from_rest",
             )
         )
@@ -579,7 +589,8 @@ def _remarks(s: FloatArray, p: Any, rate_hz: float) -> list[Remark]:
         found.append(
             Remark(
                 "upside_down",
-                f"the sensor's z axis points down at rest (roll {roll:.0f}°, pitch {pitch:.0f}°); it was levelled fully",
+                f"the sensor's z axis points down at rest (roll {roll:.0f}°, pitch {pitch:.0f}°); it was "
+                f"levelled fully",
             )
         )
     if s[la.MOVED] == 0:
@@ -593,7 +604,8 @@ def _remarks(s: FloatArray, p: Any, rate_hz: float) -> list[Remark]:
         found.append(
             Remark(
                 "never_still",
-                f"the detector {p.detector} never found the foot still: nothing was corrected; check its thresholds",
+                f"the detector {p.detector} never found the foot still: nothing was corrected; check its "
+                f"thresholds",
                 fatal=True,
             )
         )

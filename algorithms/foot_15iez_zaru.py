@@ -1,4 +1,6 @@
-"""Foot-mounted error-state Kalman filter with fifteen states, zero-velocity and zero-rate updates ("15IEZ+ZARU")."""
+"""Foot-mounted error-state Kalman filter with fifteen states, zero-velocity and zero-rate updates
+("15IEZ+ZARU").
+"""
 
 from __future__ import annotations
 
@@ -143,12 +145,14 @@ def flush(state: FloatArray, out: FloatArray) -> int:
 class Foot15IezZaru(foot.FootEstimator):
     """Error-state Kalman filter with fifteen states, zero-velocity and zero-angular-rate updates.
 
-    Source: foot-navigation dissertation, eqs 3.43–3.44. δx = [δφ, δω_b, δp, δv, δa_b], error = estimate − truth, so F
-    has −C Δt from δω_b to δφ and from δa_b to δv, and both zero velocity and zero rate see their error with H = +I.
+    Source: foot-navigation dissertation, eqs 3.43–3.44. δx = [δφ, δω_b, δp, δv, δa_b], error = estimate −
+    truth, so F has −C Δt from δω_b to δφ and from δa_b to δv, and both zero velocity and zero rate see their
+    error with H = +I.
 
-    Departures: the source updates the bias in every stance; here the zero angular rate needs a rest of its own
-    (``zaru_after_s``, ``zaru_gyr_max``), because a walking foot turns by 0.1–0.5 rad/s while it counts as still. The
-    prior of the gyroscope bias is what the rest leaves open (3e-4 rad/s); a loose one ruins the walk.
+    Departures: the source updates the bias in every stance; here the zero angular rate needs a rest of its
+    own (``zaru_after_s``, ``zaru_gyr_max``), because a walking foot turns by 0.1–0.5 rad/s while it counts
+    as still. The prior of the gyroscope bias is what the rest leaves open (3e-4 rad/s); a loose one ruins
+    the walk.
     """
 
     name: ClassVar[str] = "foot.15iez-zaru"

@@ -126,11 +126,11 @@ def configure(state: FloatArray, params: Any) -> None:
 class Foot9Iez(foot.FootEstimator):
     """Error-state Kalman filter with nine states (attitude, position, velocity) and zero-velocity updates.
 
-    Source: foot-navigation dissertation, eqs 3.28–3.42 (after Jiménez et al. 2010). F = [[I, 0, 0], [0, I, IΔt],
-    [−[f_n]×Δt, 0, I]], Q = diag(σ_ω², 0, σ_a²)Δt², P0 = 0, H = [0 0 I], R = σ_v².
+    Source: foot-navigation dissertation, eqs 3.28–3.42 (after Jiménez et al. 2010). F = [[I, 0, 0], [0, I,
+    IΔt], [−[f_n]×Δt, 0, I]], Q = diag(σ_ω², 0, σ_a²)Δt², P0 = 0, H = [0 0 I], R = σ_v².
 
-    Departures: the signs before R in (3.36) and Q in (3.37) and the Δt in (3.41) are taken for misprints; Joseph form,
-    the three velocities one after another (equal to all at once).
+    Departures: the signs before R in (3.36) and Q in (3.37) and the Δt in (3.41) are taken for misprints;
+    Joseph form, the three velocities one after another (equal to all at once).
     """
 
     name: ClassVar[str] = "foot.9iez"

@@ -71,7 +71,8 @@ class Foot9IezKfParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=T
     zupt_turns: Annotated[
         bool,
         meta(
-            "Let the zero-velocity update correct this orientation too, which the source leaves to its own filter"
+            "Let the zero-velocity update correct this orientation too; the source leaves it to its own "
+            "filter"
         ),
     ] = False
 
@@ -173,13 +174,13 @@ def flush(state: FloatArray, out: FloatArray) -> int:
 class Foot9IezKf(foot.FootEstimator):
     """Position and velocity of the nine-state filter, orientation of a Kalman filter with gyroscope biases.
 
-    Source: foot-navigation dissertation, section 3.6.2: the gyroscope predicts, the accelerometer corrects roll and
-    pitch, the zero angular rate while still corrects the biases.
+    Source: foot-navigation dissertation, section 3.6.2: the gyroscope predicts, the accelerometer corrects
+    roll and pitch, the zero angular rate while still corrects the biases.
 
-    Departures: the states are the small errors about the level axes and the three biases, not roll, pitch and yaw: the
-    same filter to first order, without the singularity at pitch ±90° that a shoe comes near. The accelerometer levels
-    in stance only, where it measures gravity, and the zero angular rate has its own stricter rest. The orientation is
-    considered in the position filter, as in ``foot.9iez-mad``.
+    Departures: the states are the small errors about the level axes and the three biases, not roll, pitch
+    and yaw: the same filter to first order, without the singularity at pitch ±90° that a shoe comes near.
+    The accelerometer levels in stance only, where it measures gravity, and the zero angular rate has its own
+    stricter rest. The orientation is considered in the position filter, as in ``foot.9iez-mad``.
     """
 
     name: ClassVar[str] = "foot.9iez-kf"

@@ -37,7 +37,8 @@ class Foot9IezMadParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=
     zupt_turns: Annotated[
         bool,
         meta(
-            "Let the zero-velocity update correct this orientation too, which the source leaves to its own filter"
+            "Let the zero-velocity update correct this orientation too; the source leaves it to its own "
+            "filter",
         ),
     ] = False
 
@@ -55,9 +56,11 @@ def madgwick(
     dt: float,
     beta: float,
 ) -> None:
-    """Carry the quaternion (wxyz, rot_nb) at ``s[q:q+4]`` over ``dt``: Madgwick 2010, eqs 11–13, 20–21, 25–34 (IMU).
+    """Carry the quaternion (wxyz, rot_nb) at ``s[q:q+4]`` over ``dt``: Madgwick 2010, eqs 11–13, 20–21,
+    25–34 (IMU).
 
-    ``a`` is the specific force in any unit, ``w`` the angular rate in rad/s. A force of norm zero is left out.
+    ``a`` is the specific force in any unit, ``w`` the angular rate in rad/s. A force of norm zero is left
+    out.
     """
     a, b, c, d = s[q], s[q + 1], s[q + 2], s[q + 3]
     da = 0.5 * (-b * wx - c * wy - d * wz)
@@ -161,11 +164,13 @@ def flush(state: FloatArray, out: FloatArray) -> int:
 class Foot9IezMad(foot.FootEstimator):
     """Position and velocity of the nine-state filter, orientation of Madgwick's gradient filter for IMU.
 
-    Source: foot-navigation dissertation, eq 3.18 and section 3.6; Madgwick (2010), "An efficient orientation filter for
-    inertial and inertial/magnetic sensor arrays". The initial orientation and the gyroscope bias come from the rest.
+    Source: foot-navigation dissertation, eq 3.18 and section 3.6; Madgwick (2010), "An efficient orientation
+    filter for inertial and inertial/magnetic sensor arrays". The initial orientation and the gyroscope bias
+    come from the rest.
 
-    Departure: the zero-velocity update never touches the orientation, so its error is "considered" (Schmidt): it counts
-    in P but gets no gain; dropping the attitude part of an ordinary update, as a cascade does, would make P too small.
+    Departure: the zero-velocity update never touches the orientation, so its error is "considered"
+    (Schmidt): it counts in P but gets no gain; dropping the attitude part of an ordinary update, as a
+    cascade does, would make P too small.
     """
 
     name: ClassVar[str] = "foot.9iez-mad"

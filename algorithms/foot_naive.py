@@ -54,8 +54,8 @@ def flush(state: FloatArray, out: FloatArray) -> int:
 class FootNaive(foot.FootEstimator):
     """Strapdown mechanization from the rest at the start, never corrected; the detector only watches.
 
-    Source: foot-navigation dissertation, eqs 3.19–3.27 (see :mod:`.strapdown`); the default is the authors' program
-    (trapezoids), ``integration="euler"`` is the text.
+    Source: foot-navigation dissertation, eqs 3.19–3.27 (see :mod:`.strapdown`); the default is the authors'
+    program (trapezoids), ``integration="euler"`` is the text.
     """
 
     name: ClassVar[str] = "foot.naive"

@@ -1,6 +1,7 @@
 """Kalman steps on error-state covariances that lie row by row in a packed buffer.
 
-Plain loops and no BLAS: compiled, interpreted, in a block or one by one give the same bits. Error = estimate − truth.
+Plain loops and no BLAS: compiled, interpreted, in a block or one by one give the same bits. Error = estimate
+− truth.
 """
 
 from __future__ import annotations
@@ -24,12 +25,13 @@ def update(
     variance: float,
     considered: int,
 ) -> None:
-    """Take a measurement of error state ``index`` into the n×n covariance at ``s[p]`` and the correction at ``s[dx]``.
+    """Take a measurement of error state ``index`` into the n×n covariance at ``s[p]`` and the correction at
+    ``s[dx]``.
 
-    Measurements with independent noise are taken one after another, which equals taking them together; ``seen`` is the
-    error as measured before any of them (the correction so far is subtracted here). The first ``considered`` states are
-    not corrected (Schmidt's consider filter): their uncertainty counts, their gain is zero.
-    ``s[work:work + 2n]`` is work space.
+    Measurements with independent noise are taken one after another, which equals taking them together;
+    ``seen`` is the error as measured before any of them (the correction so far is subtracted here). The
+    first ``considered`` states are not corrected (Schmidt's consider filter): their uncertainty counts,
+    their gain is zero. ``s[work:work + 2n]`` is work space.
     """
     total = s[p + index * n + index] + variance
     residual = seen - s[dx + index]
@@ -41,10 +43,11 @@ def update(
 
 @njit(cache=True, nogil=True)
 def joseph(s: FloatArray, p: int, n: int, work: int, index: int, total: float) -> None:
-    """Update the covariance for any gain K at ``s[work]`` on a measurement h = e_index; ``total`` = hᵀ P h + r.
+    """Update the covariance for any gain K at ``s[work]`` on a measurement h = e_index; ``total`` = hᵀ P h +
+    r.
 
-    Joseph's form (I − K hᵀ) P (I − K hᵀ)ᵀ + K r Kᵀ, multiplied out: P − K hᵀP − P h Kᵀ + K total Kᵀ; computed once a
-    pair and written into both triangles, so P stays symmetric to the bit.
+    Joseph's form (I − K hᵀ) P (I − K hᵀ)ᵀ + K r Kᵀ, multiplied out: P − K hᵀP − P h Kᵀ + K total Kᵀ;
+    computed once a pair and written into both triangles, so P stays symmetric to the bit.
     """
     row = work + n
     for j in range(n):
@@ -70,10 +73,11 @@ def mirror(s: FloatArray, p: int, n: int) -> None:
 def predict_motion(
     s: FloatArray, p: int, n: int, att: int, pos: int, vel: int, force: int, dt: float
 ) -> None:
-    """Carry the covariance at ``s[p]`` over ``dt`` by δp += δv Δt and δv += −[f_n]×Δt δφ (Q is added elsewhere).
+    """Carry the covariance at ``s[p]`` over ``dt`` by δp += δv Δt and δv += −[f_n]×Δt δφ (Q is added
+    elsewhere).
 
-    ``att``, ``pos``, ``vel`` are the first states of the three errors, ``s[force:force+3]`` is f_n. P ← F P Fᵀ is done
-    in place, rows first, then columns; call :func:`mirror` when all of Q and F is done.
+    ``att``, ``pos``, ``vel`` are the first states of the three errors, ``s[force:force+3]`` is f_n. P ← F P
+    Fᵀ is done in place, rows first, then columns; call :func:`mirror` when all of Q and F is done.
     """
     x, y, z = s[force] * dt, s[force + 1] * dt, s[force + 2] * dt
     a = p + att * n
@@ -104,8 +108,8 @@ def predict_motion(
 def predict_bias(s: FloatArray, p: int, n: int, to: int, bias: int, rot: int, dt: float) -> None:
     """Carry the covariance at ``s[p]`` over ``dt`` by δ_to += −C Δt δ_bias, with C = rot_nb at ``s[rot]``.
 
-    The sign follows from error = estimate − truth: the rate used is the measured one minus the bias estimate, so a bias
-    that is estimated too high turns (or pushes) too little.
+    The sign follows from error = estimate − truth: the rate used is the measured one minus the bias
+    estimate, so a bias that is estimated too high turns (or pushes) too little.
     """
     a = p + to * n
     b = p + bias * n

@@ -1,9 +1,10 @@
 """Where everything lies in the packed float64 state that the foot estimators share.
 
-A state is three stretches: the core below (configuration, counters, rest initialisation, navigation, steps), the
-filter's own numbers (from ``CORE`` on; each estimator's module allocates them with :class:`Allocator`), and a ring of
-the newest samples (offset in ``RING``). All offsets are module constants, so numba compiles them in; only the ring's
-place and length depend on parameters. Copying the buffer is a snapshot, writing it back is a seek.
+A state is three stretches: the core below (configuration, counters, rest initialisation, navigation, steps),
+the filter's own numbers (from ``CORE`` on; each estimator's module allocates them with :class:`Allocator`),
+and a ring of the newest samples (offset in ``RING``). All offsets are module constants, so numba compiles
+them in; only the ring's place and length depend on parameters. Copying the buffer is a snapshot, writing it
+back is a seek.
 """
 
 from __future__ import annotations

@@ -19,10 +19,9 @@ def meta(
     le: float | None = None,
     lt: float | None = None,
 ) -> msgspec.Meta:
-    """Return the annotation of a parameter: what it does, its unit, where its default comes from, its range."""
-    return msgspec.Meta(
-        description=effect, extra_json_schema={"unit": unit, "source": source}, ge=ge, gt=gt, le=le, lt=lt
-    )
+    """Return the annotation of a parameter: effect, unit, where its default comes from, its range."""
+    bounds: dict[str, Any] = {"ge": ge, "gt": gt, "le": le, "lt": lt}
+    return msgspec.Meta(description=effect, extra_json_schema={"unit": unit, "source": source}, **bounds)
 
 
 @dataclass(frozen=True)

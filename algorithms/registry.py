@@ -21,8 +21,8 @@ GROUP = "marcha.estimators"
 def available() -> dict[str, type[PlainEstimator]]:
     """Return every installed estimator by name, sorted.
 
-    Built-in ones and plug-ins register alike, as entry points of the group ``marcha.estimators``. A plug-in that
-    cannot be loaded, or that is no estimator, is left out with a warning that names it.
+    Built-in ones and plug-ins register alike, as entry points of the group ``marcha.estimators``. A plug-in
+    that cannot be loaded, or that is no estimator, is left out with a warning that names it.
     """
     found: dict[str, type[PlainEstimator]] = {}
     for point in _points(entry_points, tuple(sys.path)):
@@ -62,7 +62,8 @@ def make(name: str, /, *, preset: str | None = None, **params: Any) -> PlainEsti
     preset : str, optional
         A named parameter set of the estimator; ``params`` go on top of it.
     **params
-        Values of the estimator's own parameters; text is converted (``"0.1"`` to 0.1), as a command line needs.
+        Values of the estimator's own parameters; text is converted (``"0.1"`` to 0.1), as a command line
+        needs.
 
     Raises
     ------
@@ -104,7 +105,9 @@ def _preset(name: str, cls: type[PlainEstimator], preset: str | None) -> dict[st
 
 @lru_cache(maxsize=8)
 def _points(scan: Callable[..., Any], path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """Return the entry points by name. A scan of all that is installed takes 10 ms: one for each ``sys.path``."""
+    """Return the entry points by name. A scan of all that is installed takes 10 ms: one for each
+    ``sys.path``.
+    """
     return tuple(sorted(scan(group=GROUP), key=lambda p: p.name))
 
 

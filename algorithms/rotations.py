@@ -1,7 +1,8 @@
 """Rotations as numba kernels on stretches of a packed buffer.
 
-``rot_nb`` takes coordinates from the body frame b to the navigation frame n and lies row by row in nine consecutive
-entries. Quaternions are ``wxyz``, Hamilton, of the same rotation. Angles: ``C = Rz(yaw) Ry(pitch) Rx(roll)``.
+``rot_nb`` takes coordinates from the body frame b to the navigation frame n and lies row by row in nine
+consecutive entries. Quaternions are ``wxyz``, Hamilton, of the same rotation. Angles: ``C = Rz(yaw)
+Ry(pitch) Rx(roll)``.
 """
 
 from __future__ import annotations
@@ -86,10 +87,11 @@ def rot_from_quat(q: FloatArray, at: int, s: FloatArray, to: int) -> None:
 
 @njit(cache=True, nogil=True)
 def turn_body(s: FloatArray, at: int, x: float, y: float, z: float) -> None:
-    """Multiply the rotation at ``s[at:at+9]`` from the right by ``(2I + [θ]×)(2I − [θ]×)⁻¹``, θ = (x, y, z) in rad.
+    """Multiply the rotation at ``s[at:at+9]`` from the right by ``(2I + [θ]×)(2I − [θ]×)⁻¹``, θ = (x, y, z)
+    in rad.
 
-    The Padé form of ``exp([θ]×)`` is Cayley's transform: with a = θ/2 it equals ``I + 2([a]× + [a]×²)/(1 + a·a)``,
-    which is exactly orthonormal.
+    The Padé form of ``exp([θ]×)`` is Cayley's transform: with a = θ/2 it equals ``I + 2([a]× + [a]×²)/(1 +
+    a·a)``, which is exactly orthonormal.
     """
     a, b, c = 0.5 * x, 0.5 * y, 0.5 * z
     k = 2.0 / (1.0 + a * a + b * b + c * c)
@@ -111,7 +113,9 @@ def turn_body(s: FloatArray, at: int, x: float, y: float, z: float) -> None:
 
 @njit(cache=True, nogil=True)
 def turn_nav(s: FloatArray, at: int, x: float, y: float, z: float) -> None:
-    """Multiply the rotation at ``s[at:at+9]`` from the left by ``(2I + [θ]×)(2I − [θ]×)⁻¹``, θ = (x, y, z) in rad."""
+    """Multiply the rotation at ``s[at:at+9]`` from the left by ``(2I + [θ]×)(2I − [θ]×)⁻¹``, θ = (x, y, z)
+    in rad.
+    """
     a, b, c = 0.5 * x, 0.5 * y, 0.5 * z
     k = 2.0 / (1.0 + a * a + b * b + c * c)
     m00 = 1.0 - k * (b * b + c * c)

@@ -4,12 +4,12 @@ Frames: b sensor, n local level with z up, yaw 0 at the start. At rest the accel
 
 Rest initialisation (dissertation, section 3.6): gyroscope bias = mean rate; roll = atan2(ay, az),
 pitch = atan2(−ax, √(ay² + az²)) of the mean specific force, so any mounting is levelled, upside down too.
-The rest is verified, not assumed: it is the first stretch of ``init_s`` in which every sample stays within ``rest_acc``
-and ``rest_gyr`` of the running mean, and whose mean rate is small enough to be a bias.
+The rest is verified, not assumed: it is the first stretch of ``init_s`` in which every sample stays within
+``rest_acc`` and ``rest_gyr`` of the running mean, and whose mean rate is small enough to be a bias.
 
 Mechanization (eqs 3.19–3.27): C ← C (2I + [ω]×Δt)(2I − [ω]×Δt)⁻¹. ``trapezoid`` (the authors' program):
-f_n = ½(C_old + C) f, v += ½(a_old + a)Δt, p += ½(v_old + v)Δt with a = f_n + g; ``euler`` (the text): f_n = C f,
-v += aΔt, p += vΔt. Biases are subtracted from the measured rate and specific force.
+f_n = ½(C_old + C) f, v += ½(a_old + a)Δt, p += ½(v_old + v)Δt with a = f_n + g; ``euler`` (the text): f_n =
+C f, v += aΔt, p += vΔt. Biases are subtracted from the measured rate and specific force.
 """
 
 from __future__ import annotations
@@ -66,7 +66,9 @@ def _distance(s: FloatArray, a: int, b: int) -> float:
 
 @njit(cache=True, nogil=True)
 def watch_rest(s: FloatArray, r: int, k: int) -> bool:
-    """Take sample ``k`` (record at ``r``) into the search for a rest; return True at the sample that completes it."""
+    """Take sample ``k`` (record at ``r``) into the search for a rest; return True at the sample that
+    completes it.
+    """
     if s[INIT_INDEX] >= 0.0:
         if (
             _distance(s, r + R_ACC, INIT_MEAN) > s[REST_ACC]
@@ -140,7 +142,7 @@ def turn(s: FloatArray, r: int) -> None:
 
 @njit(cache=True, nogil=True)
 def resolve(s: FloatArray, r: int) -> None:
-    """Write the bias-free specific force of the sample at ``r`` in n, by the present attitude, to ``ACC_N``."""
+    """Write the bias-free specific force of the sample at ``r``, by the present attitude, to ``ACC_N``."""
     x = s[r + R_ACC] - s[BIAS_ACC]
     y = s[r + R_ACC + 1] - s[BIAS_ACC + 1]
     z = s[r + R_ACC + 2] - s[BIAS_ACC + 2]

@@ -1,4 +1,6 @@
-"""The filters of the dissertation in plain NumPy matrices, written from the equations and not from the kernels."""
+"""The filters of the dissertation in plain NumPy matrices, written from the equations and not from the
+kernels.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +79,7 @@ def turned(c: np.ndarray, error: np.ndarray) -> np.ndarray:
 def filter9(
     rows: np.ndarray, still: np.ndarray, first: int, gyr: float = 0.01, acc: float = 0.1, vel: float = 0.01
 ) -> np.ndarray:
-    """Return position, velocity, standard deviations (pos, vel, att) and rotation from sample ``first`` on."""
+    """Return position, velocity, sigmas (pos, vel, att) and rotation from sample ``first`` on."""
     m = Mechanization(rows[: first + 1, 1:7].mean(axis=0))
     p = np.zeros((9, 9))
     h = np.hstack([np.zeros((3, 6)), np.eye(3)])
@@ -149,7 +151,7 @@ def _state(m: Mechanization, p: np.ndarray, pos: int, vel: int) -> np.ndarray:
 
 
 def madgwick(q: np.ndarray, f: np.ndarray, w: np.ndarray, dt: float, beta: float) -> np.ndarray:
-    """One step of Madgwick 2010 for IMU with its published matrices: f_g (25), J_g (26), gradient Jᵀf (34)."""
+    """One step of Madgwick 2010 for IMU, published matrices: f_g (25), J_g (26), gradient Jᵀf (34)."""
     q1, q2, q3, q4 = q
     ax, ay, az = f / np.linalg.norm(f)
     objective = np.array(

@@ -84,7 +84,8 @@ def test_upside_down_gives_the_same_walk(name: str) -> None:
     result, estimator = run(name, turned)
     found = remarks(estimator)
     assert not found["upside_down"].fatal
-    # Madgwick's step is normalized before its part along the quaternion falls away: how much turns depends on mounting.
+    # Madgwick's step is normalized before its part along the quaternion falls away: how much turns depends
+    # on mounting.
     slack = 0.2 if name == "foot.9iez-mad" else 1e-6
     np.testing.assert_allclose(positions(result)[300:], positions(upright)[300:], atol=slack)
 

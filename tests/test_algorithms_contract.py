@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from marcha.algorithms import make
 from .algorithms_support import FOOT, simulated
 from .contracts.estimator import EstimatorContract
 
-QUICK = {"init_s": 0.5}
+QUICK: dict[str, Any] = {"init_s": 0.5}
 
 
 class FootContract(EstimatorContract):
@@ -34,12 +35,12 @@ class Test9Iez(FootContract):
 
 class Test9IezFillBurst(FootContract):
     name = "foot.9iez"
-    params = QUICK | {"cleaning": "fill-burst", "detector": "pitch"}  # noqa: RUF012
+    params = QUICK | {"cleaning": "fill-burst", "detector": "pitch"}
 
 
 class Test9IezLive(FootContract):
     name = "foot.9iez"
-    params = QUICK | {"window_side": "trailing", "cleaning": "none", "detector": "shoe"}  # noqa: RUF012
+    params = QUICK | {"window_side": "trailing", "cleaning": "none", "detector": "shoe"}
 
 
 class Test9IezMad(FootContract):

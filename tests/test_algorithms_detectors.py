@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -100,7 +102,7 @@ def judge(kind: str, stats: np.ndarray) -> np.ndarray:
 def runs(flags: np.ndarray) -> list[tuple[int, int, bool]]:
     """Return (first, past the last, value) of every stretch of equal values."""
     edges = [0, *(np.flatnonzero(np.diff(flags)) + 1), len(flags)]
-    return [(a, b, bool(flags[a])) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [(a, b, bool(flags[a])) for a, b in itertools.pairwise(edges)]
 
 
 def clean(raw: np.ndarray, cleaning: str, length: int, side: str) -> np.ndarray:

@@ -81,7 +81,9 @@ def test_the_zero_angular_rate_takes_part_in_that_comparison() -> None:
 
 
 def mechanize15(x: np.ndarray, c0: np.ndarray, f: np.ndarray, w: np.ndarray, dt: float) -> np.ndarray:
-    """One Euler step from the state perturbed by x = [δφ, δω_b, δp, δv, δa_b] (estimate − truth); same errors out."""
+    """One Euler step from the state perturbed by x = [δφ, δω_b, δp, δv, δa_b] (estimate − truth); same
+    errors out.
+    """
 
     def step(e: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         c = Rotation.from_rotvec(e[0:3]).as_matrix() @ c0
@@ -97,7 +99,9 @@ def mechanize15(x: np.ndarray, c0: np.ndarray, f: np.ndarray, w: np.ndarray, dt:
 
 
 @given(force=VECTOR, rate=VECTOR, turn=VECTOR, dt=st.floats(1e-3, 0.02))
-def test_transition_is_the_jacobian_of_the_mechanization(force: tuple, rate: tuple, turn: tuple, dt: float) -> None:
+def test_transition_is_the_jacobian_of_the_mechanization(
+    force: tuple, rate: tuple, turn: tuple, dt: float
+) -> None:
     f, w = np.array(force) * 10, np.array(rate) * 4
     c = Rotation.from_rotvec(turn).as_matrix()
     eps = 1e-6
@@ -161,9 +165,10 @@ def test_madgwick_equals_the_published_matrices() -> None:
     q = np.array([1.0, 0, 0, 0])
     s = np.zeros(4)
     s[0] = 1.0
-    for f, w in zip(rng.normal(size=(n, 3)) + [0, 0, 9.81], rng.normal(size=(n, 3)), strict=True):
+    force = rng.normal(size=(n, 3)) + np.array([0, 0, 9.81])
+    for f, w in zip(force, rng.normal(size=(n, 3)), strict=True):
         q = ref.madgwick(q, f, w, 0.01, 0.1)
-        foot_9iez_mad.madgwick(s, 0, *f, *w, 0.01, 0.1)
+        foot_9iez_mad.madgwick(s, 0, f[0], f[1], f[2], w[0], w[1], w[2], 0.01, 0.1)
     np.testing.assert_allclose(s, q, rtol=0, atol=1e-12)
 
 
@@ -215,7 +220,7 @@ def test_constant_rate_turns_by_rate_times_time(axis: int) -> None:
 
 
 def test_coning_is_followed() -> None:
-    """A cone of half angle a at Ω: the body rate has a constant part that a naive sum of angles would miss."""
+    """A cone of half angle a at Ω: the body rate has a constant part that a sum of angles would miss."""
     rate, cone, speed = 1000.0, 0.2, 2 * np.pi
     t = np.arange(0, 5, 1 / rate)
     truth = Rotation.from_rotvec(cone * np.column_stack([np.cos(speed * t), np.sin(speed * t), 0 * t]))
@@ -247,7 +252,8 @@ def test_any_mounting_is_levelled(angles: tuple[float, float]) -> None:
         assert "upside_down" not in {r.kind for r in estimator.remarks()}
 
 
-# --- rotations -----------------------------------------------------------------------------------------------
+# --- rotations
+# -----------------------------------------------------------------------------------------------
 
 
 @given(turn=st.tuples(*[st.floats(-3, 3)] * 3), start=st.tuples(*[st.floats(-3, 3)] * 3))

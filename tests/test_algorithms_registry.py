@@ -61,7 +61,7 @@ def test_a_broken_plugin_is_a_warning_with_its_name(installed, value: str) -> No
         assert list(available()) == ["good"]
     with (
         pytest.warns(UserWarning, match="'broken'"),
-        pytest.raises(AlgorithmError, match="cannot be loaded.*good"),
+        pytest.raises(AlgorithmError, match=r"cannot be loaded.*good"),
     ):
         find("broken")
 

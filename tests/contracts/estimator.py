@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -25,12 +25,13 @@ def equal(a: list[np.ndarray | None], b: list[np.ndarray | None]) -> bool:
 class EstimatorContract:
     """Subclass as ``class TestMine(EstimatorContract)``; set ``name`` or override :meth:`make`, give rows.
 
-    What it promises: declared columns, latency as declared, the same bits for the same rows however they are handed
-    over (one by one, in blocks of any size, after a snapshot and a restore), and rows that are left as they were.
+    What it promises: declared columns, latency as declared, the same bits for the same rows however they are
+    handed over (one by one, in blocks of any size, after a snapshot and a restore), and rows that are left
+    as they were.
     """
 
     name: str = ""
-    params: dict[str, Any] = {}  # noqa: RUF012
+    params: ClassVar[dict[str, Any]] = {}
 
     def make(self) -> Any:
         return make(self.name, **self.params)
