@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from .cdr import CdrError, decode, encode
-from .codec import MAX_TIME_NS, PREFIX, SECOND, Messages
+from .codec import MAX_TIME_NS, PREFIX, SECOND, Columns, Messages
 from .definitions import Library, load
 from .errors import MarchaError
 
@@ -138,5 +138,13 @@ class EventDecoder:
             label = pairs.pop("label", "")
             text = json.dumps(pairs, ensure_ascii=False, sort_keys=True)
             rows.append((start, int(messages.log[i]), start, end, label, text))
-        names = {"t_ns": pl.Int64, "t_log_ns": pl.Int64, **{k: v for k, v in COLUMNS.items() if k != "tier"}}
+        names: dict[str, Any] = {
+            "t_ns": pl.Int64,
+            "t_log_ns": pl.Int64,
+            **{k: v for k, v in COLUMNS.items() if k != "tier"},
+        }
         return pl.DataFrame(rows, schema=names, orient="row")
+
+    def decode_columns(self, messages: Messages) -> Columns:
+        """Return what :meth:`decode` returns as series."""
+        return self.decode(messages).to_dict()

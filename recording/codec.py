@@ -407,6 +407,10 @@ def _set_time(records: NDArray[Any], path: str, t_ns: NDArray[np.int64]) -> None
 # ---------------------------------------------------------------------------------------- messages to tables
 
 
+Columns = dict[str, Any]
+"""Column name to array or series, all of one length."""
+
+
 class Messages(NamedTuple):
     """The messages of one channel within one chunk.
 
@@ -464,15 +468,16 @@ class Decoder:
         CdrError
             A message does not fit the definition.
         """
-        n = len(messages.log)
-        if n == 0:
-            return pl.DataFrame({"t_ns": [], "t_log_ns": []}, schema={"t_ns": pl.Int64, "t_log_ns": pl.Int64})
+        return pl.DataFrame(self.decode_columns(messages))
+
+    def decode_columns(self, messages: Messages) -> Columns:
+        """Return what :meth:`decode` returns as arrays, which are cheaper to join than frames."""
         plan = self._plan or self._make_plan(messages.message(0))
         block = self._fits(plan, messages)
         if block is not None and not plan.explode:
             self._plan = plan
-            return self._frame(plan, plan.bindings, block, messages)
-        return self._ordinary(messages)
+            return _columns(plan, plan.bindings, block, messages)
+        return self._ordinary(messages).to_dict()
 
     def frame_id(self, message: memoryview) -> str:
         """Return the frame id of a message."""
@@ -501,23 +506,11 @@ class Decoder:
             part = messages.take(np.array(rows))
             block = _view(part, plan.layout.dtype)
             for k, bindings in enumerate(plan.rows):
-                frame = self._frame(plan, bindings, block, part, k)
+                frame = pl.DataFrame(_columns(plan, bindings, block, part, k))
                 frames.append(frame.with_columns(pl.Series("#", rows), pl.lit(k).alias("#k")))
         if not frames:
             return pl.DataFrame(schema={"t_ns": pl.Int64, "t_log_ns": pl.Int64})
         return pl.concat(frames, how="diagonal_relaxed").sort("#", "#k", maintain_order=True).drop("#", "#k")
-
-    def _frame(
-        self, plan: Plan, bindings: Sequence[Binding], block: NDArray[Any], messages: Messages, row: int = 0
-    ) -> pl.DataFrame:
-        stamp = plan.stamps[row]
-        out: dict[str, Any] = {
-            "t_ns": messages.publish if stamp is None else _get_time(block, stamp),
-            "t_log_ns": messages.log,
-        }
-        for column, kind, path in bindings:
-            out[column] = _READ[kind](plan.layout, block, path)
-        return pl.DataFrame(out)
 
 
 class Plan:
@@ -568,6 +561,20 @@ class Plan:
     def fits(self, block: NDArray[Any]) -> bool:
         """Return whether all messages have this layout and the same frame id and names."""
         return bool(self.layout.fits(block).all()) and all((block[p] == v).all() for p, v in self._constants)
+
+
+def _columns(
+    plan: Plan, bindings: Sequence[Binding], block: NDArray[Any], messages: Messages, row: int = 0
+) -> Columns:
+    """Return the columns of messages of one layout; all are copies, since the chunk's bytes go away."""
+    stamp = plan.stamps[row]
+    out: Columns = {
+        "t_ns": messages.publish if stamp is None else _get_time(block, stamp),
+        "t_log_ns": messages.log,
+    }
+    for column, kind, path in bindings:
+        out[column] = _READ[kind](plan.layout, block, path)
+    return out
 
 
 def _bind(

@@ -34,7 +34,7 @@ from .chunks import (
     read_index,
     split,
 )
-from .codec import Decoder, Encoder, Messages
+from .codec import Columns, Decoder, Encoder, Messages
 from .definitions import load, long_name, parse_full
 from .errors import Finding, MarchaError, UsageError
 from .schemas import SCHEMAS, Schema
@@ -262,10 +262,10 @@ class Recording:
         """
         source = self._source(topic)
         refs = self.chunk_refs(set(source.ids), start_ns, end_ns)
-        parts: list[pl.DataFrame] = []
+        parts: list[Columns] = []
         with _Pool(len(refs)) as pool:
-            for tables in pool.map(lambda ref: self._decode(ref, [source], start_ns, end_ns), refs):
-                parts += tables.values()
+            for decoded in pool.map(lambda ref: self._decode(ref, [source], start_ns, end_ns), refs):
+                parts += [columns for _, columns in decoded]
         table = _join(parts) if parts else self._empty(source)
         return table if log_time else table.drop("t_log_ns")
 
@@ -299,10 +299,9 @@ class Recording:
         held: dict[str, list[pl.DataFrame]] = {s.topic: [] for s in sources}
         with _Pool(len(refs)) as pool:
             decoded = pool.map(lambda ref: self._decode(ref, sources, start_ns, end_ns), refs)
-            for i, tables in enumerate(decoded):
-                for topic, table in tables.items():
-                    if table.height:
-                        held[topic].append(table)
+            for i, parts in enumerate(decoded):
+                for topic, columns in parts:
+                    held[topic].append(pl.DataFrame(columns))
                 horizon = refs[i + 1].first_ns if i + 1 < len(refs) else None
                 if horizon is None or _complete(held, horizon) >= max_rows:
                     yield from self._emit(held, horizon, max_rows)
@@ -410,15 +409,15 @@ class Recording:
 
     def _decode(
         self, ref: ChunkRef, sources: Sequence[Source], start_ns: int | None, end_ns: int | None
-    ) -> dict[str, pl.DataFrame]:
-        """Return the rows of one chunk by topic; a broken chunk gives none and a finding."""
+    ) -> list[tuple[str, Columns]]:
+        """Return topic and columns of the rows in one chunk; a broken chunk gives none and a finding."""
         topic_of = {i: s for s in sources for i in s.ids}
         try:
             parts = split(read_chunk(self.file, ref, reuse=True), topic_of)  # a table holds copies
         except ChunkError as e:
             self.lost(ref, str(e))
-            return {}
-        out: dict[str, pl.DataFrame] = {}
+            return []
+        out: list[tuple[str, Columns]] = []
         for id_, messages in sorted(parts.items()):
             source = topic_of[id_]
             keep = _between(messages, start_ns, end_ns)
@@ -428,11 +427,12 @@ class Recording:
                 continue
             assert source.decoder is not None
             try:
-                table = source.decoder.decode(messages)
+                columns = source.decoder.decode_columns(messages)
             except CdrError as e:
                 self.lost(ref, f"{source.topic}: chunk at byte {ref.start}: {e}")
                 continue
-            out[source.topic] = _join([out[source.topic], table]) if source.topic in out else table
+            if len(columns["t_ns"]):
+                out.append((source.topic, columns))
         return out
 
     def lost(self, ref: ChunkRef, detail: str) -> None:
@@ -449,7 +449,7 @@ class Recording:
         for topic, parts in held.items():
             if not parts:
                 continue
-            table = _join(parts)
+            table = _in_order(pl.concat(parts, how="diagonal_relaxed"))
             at = (
                 table.height
                 if horizon is None
@@ -604,12 +604,17 @@ def _between(messages: Messages, start_ns: int | None, end_ns: int | None) -> An
     return keep
 
 
-def _join(parts: list[pl.DataFrame]) -> pl.DataFrame:
+def _join(parts: Sequence[Columns]) -> pl.DataFrame:
     """Return the parts as one table in log-time order (stable)."""
-    same = all(p.schema == parts[0].schema for p in parts)
-    table = pl.concat(parts, how="vertical" if same else "diagonal_relaxed", rechunk=True)
-    log = table["t_log_ns"]
-    return table if log.is_sorted() else table.sort("t_log_ns", maintain_order=True)
+    if all(p.keys() == parts[0].keys() and all(isinstance(v, np.ndarray) for v in p.values()) for p in parts):
+        table = pl.DataFrame({k: np.concatenate([p[k] for p in parts]) for k in parts[0]})
+    else:
+        table = pl.concat([pl.DataFrame(p) for p in parts], how="diagonal_relaxed", rechunk=True)
+    return _in_order(table)
+
+
+def _in_order(table: pl.DataFrame) -> pl.DataFrame:
+    return table if table["t_log_ns"].is_sorted() else table.sort("t_log_ns", maintain_order=True)
 
 
 def _complete(held: dict[str, list[pl.DataFrame]], horizon: int) -> int:
