@@ -1,0 +1,69 @@
+"""Make every picture of README and docs: ``python docs/make_pictures.py [FOLDER]``, by default docs/images.
+
+Simulates walks, converts, replays, and takes the viewer's picture without a window (software Vulkan is
+enough: Debian's mesa-vulkan-drivers and libvulkan1). Pictures of views that complain are not written.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+import tempfile
+from pathlib import Path
+
+import marcha.ingest as ingest
+import marcha.recording as mr
+import marcha.replay as rp
+import marcha.viz as viz
+from marcha.ingest.simulate import simulate
+from marcha.viz.screenshot import Picture, screenshots
+
+IMAGES = Path(__file__).parent / "images"
+SENSOR = "/foot/imu2"
+FILTERS = ("foot.9iez", "foot.15iez-zaru", "foot.naive")
+DETECTORS = ("c1c2c3=foot.9iez", "shoe=foot.9iez[detector=shoe]", "pitch=foot.9iez[detector=pitch]")
+FRAME = 36
+"""Height of the window's own bar, pixels."""
+
+
+def replayed(folder: Path, scenario: str, estimators: tuple[str, ...], name: str) -> mr.Recording:
+    """Simulate a walk, convert it, and replay it through ``estimators``."""
+    raw = simulate(scenario, folder / name, seed=1)
+    walk = folder / f"{name}.raw.mcap"
+    ingest.convert(raw.paths, walk)
+    rp.replay(mr.open(walk), estimators, inputs=[SENSOR], out=folder / f"{name}.mcap")
+    return mr.open(folder / f"{name}.mcap")
+
+
+def save(picture: Picture, path: Path) -> None:
+    """Write a picture without the window's bar."""
+    from PIL import Image
+
+    if picture.reports:
+        raise SystemExit(f"{path.name}: {'; '.join(picture.reports)}")
+    image = Image.open(io.BytesIO(picture.png)).convert("RGB")
+    image.crop((0, FRAME, *image.size)).quantize(256).save(path, optimize=True)
+    print(path)
+
+
+def main() -> None:
+    """Make all pictures."""
+    images = Path(sys.argv[1]) if len(sys.argv) > 1 else IMAGES
+    images.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        walk = replayed(folder, "rectangle", FILTERS, "rectangle")
+        rrd = viz.write_rrd(walk, folder / "rectangle.rrd")
+        for picture in screenshots(rrd, ["Overview", "Raw", "Compare", "Report"], at=0.62):
+            save(picture, images / f"viewer-{picture.tab.lower()}.png")
+        detectors = replayed(folder, "rectangle", DETECTORS, "detectors")
+        rrd = viz.write_rrd(detectors, folder / "detectors.rrd")
+        for picture in screenshots(rrd, ["Detector"], at=0.62):
+            save(picture, images / "viewer-detector.png")
+        print(viz.save_figure(walk, images / "figure.png", overwrite=True))
+        others = [replayed(folder, name, FILTERS[:2], name) for name in ("figure-eight", "stairs")]
+        print(viz.save_figure(others, images / "figure-several.png", overwrite=True))
+
+
+if __name__ == "__main__":
+    main()
