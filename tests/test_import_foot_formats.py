@@ -237,6 +237,7 @@ def test_damaged_rows_are_dropped_and_cells_become_nan(tmp_path: Path, truth: Wa
     assert len(imu) == len(truth.t) - 2
     assert imu["acc_z"].is_nan().sum() == 2
     assert (report.rows_dropped, report.rows_repaired) == (2, 1)
+    assert any("'banana' is not a number" in f.detail for f in report.findings)
     assert {(f.kind, f.first_line) for f in report.findings} >= {
         ("bad_row", 21),
         ("missing_cell", 41),
