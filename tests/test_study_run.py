@@ -20,7 +20,7 @@ from marcha.ingest.simulate import simulate
 from marcha.recording import UsageError
 from marcha.recording import open as open_recording
 from marcha.replay import replay
-from marcha.replay.study import StudyConfig, StudyResult, run_study
+from marcha.replay.study import StudyConfig, StudyResult, figures, plan, run_study
 from marcha.replay.study import study as study_module
 from marcha.replay.study.cells import cached
 from marcha.replay.study.config import Recordings
@@ -67,8 +67,22 @@ def config(**changes: Any) -> StudyConfig:
     return msgspec.structs.replace(msgspec.toml.decode(CONFIG, type=StudyConfig), **changes)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def fixed_code() -> Iterator[None]:
+    """Keep cells' keys while somebody edits the code beside a running test."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(plan, "code_digest", lambda estimators: "code")
+        yield
+
+
+@pytest.fixture
+def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out what takes longest, where it is not what is tested."""
+    monkeypatch.setattr(figures, "drawings", lambda *_: [])
+
+
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> StudyResult:
+def finished(fixed_code: None, tmp_path_factory: pytest.TempPathFactory) -> StudyResult:
     return run_study(config(), tmp_path_factory.mktemp("study") / "out", workers=1, **MAKERS)
 
 
@@ -108,7 +122,7 @@ def test_results_have_one_row_a_cell(finished: StudyResult) -> None:
 
 
 def test_a_cells_figures_are_those_of_a_replay_of_its_recording(finished: StudyResult) -> None:
-    (source, *_), _ = find_sources(finished.config, None, _code(finished))
+    (source, *_), _ = find_sources(finished.config, None, "code")
     rec = open_recording(cached(source, finished.folder / "recordings"))
     alone = replay(rec, ["foot.9iez"], inputs=["/foot/imu1"]).runs[0].metrics
     row = finished.results.filter(pl.col("recording") == source.name, pl.col("filter") == "9IEZ").row(
@@ -116,10 +130,6 @@ def test_a_cells_figures_are_those_of_a_replay_of_its_recording(finished: StudyR
     )
     for name in ("closure_percent", "path_m", "height_end_m", "nees_position_end"):
         assert row[name] == alone[name]
-
-
-def _code(finished: StudyResult) -> str:
-    return msgspec.json.decode((finished.folder / "provenance.json").read_bytes())["code hash"]
 
 
 def test_means_are_those_of_the_table(finished: StudyResult) -> None:
@@ -192,6 +202,7 @@ def no_replay(*_: Any, **__: Any) -> Any:
     raise AssertionError("a finished cell was run again")
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_finished_cells_are_not_run_again(
     finished: StudyResult, copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -201,6 +212,7 @@ def test_finished_cells_are_not_run_again(
     assert again.results.equals(finished.results)
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_ctrl_c_keeps_the_finished_cells(tmp_path: Path) -> None:
     calls: list[float] = []
 
@@ -216,6 +228,7 @@ def test_ctrl_c_keeps_the_finished_cells(tmp_path: Path) -> None:
     assert (after.cells_run, after.cells_reused) == (8, 4)
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_an_added_filter_runs_alone(copy: Path) -> None:
     more = config()
     more = msgspec.structs.replace(
@@ -229,6 +242,7 @@ def test_an_added_filter_runs_alone(copy: Path) -> None:
     assert (again.cells_run, again.cells_reused) == (6, 12)
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_another_study_is_not_overwritten(copy: Path) -> None:
     before = (copy / "results.parquet").read_bytes()
     with pytest.raises(UsageError, match="another configuration"):
@@ -243,6 +257,7 @@ def test_a_folder_of_other_things_is_left_alone(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_a_damaged_cell_file_is_run_again(finished: StudyResult, copy: Path) -> None:
     victim = next((copy / "cells").iterdir())
     victim.write_bytes(victim.read_bytes()[:-7])
@@ -251,6 +266,7 @@ def test_a_damaged_cell_file_is_run_again(finished: StudyResult, copy: Path) -> 
     assert same_apart_from_times(again.results, finished.results)
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_a_recording_that_cannot_be_read_is_recorded_and_not_fatal(
     finished: StudyResult, tmp_path: Path
 ) -> None:
@@ -268,6 +284,7 @@ def test_a_recording_that_cannot_be_read_is_recorded_and_not_fatal(
     assert "failed: bad" in result.notes[0]
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_a_walk_that_an_estimator_refuses_is_recorded_and_the_others_stay(
     finished: StudyResult, tmp_path: Path
 ) -> None:
@@ -282,6 +299,7 @@ def test_a_walk_that_an_estimator_refuses_is_recorded_and_the_others_stay(
     assert status == {"good": "ok", "short": "failed"}
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_truth_of_the_study_reaches_recordings_that_lack_it(finished: StudyResult, tmp_path: Path) -> None:
     data = tmp_path / "data"
     raw = simulate("rectangle", data, seed=5, length_m=8.0, name="a")
@@ -309,6 +327,7 @@ def test_a_wrong_parameter_is_said_before_anything_runs(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_a_raw_study_without_importers_says_what_to_pass(tmp_path: Path) -> None:
     result = run_study(config(), tmp_path / "out", workers=1)
     assert result.cells_failed == 12
@@ -330,6 +349,7 @@ def cluster() -> Iterator[str]:
         yield local.scheduler_address
 
 
+@pytest.mark.usefixtures("no_figures")
 def test_a_dask_cluster_gives_the_same_results(finished: StudyResult, cluster: str, tmp_path: Path) -> None:
     result = run_study(config(), tmp_path / "out", scheduler=cluster, **MAKERS)
     assert same_apart_from_times(result.results, finished.results)

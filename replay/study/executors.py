@@ -201,7 +201,7 @@ def _on_cluster(client: Any, function: Callable[[T], R], tasks: Sequence[T]) -> 
 
     futures = {client.submit(_attempt, function, task, pure=False): task for task in tasks}
     try:
-        for future in as_completed(list(futures)):
+        for future in as_completed(list(futures), loop=client.loop):
             task = futures.pop(future)
             error = future.exception()
             if error is None:
