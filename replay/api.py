@@ -11,10 +11,11 @@ from typing import Any, Literal
 
 from ..algorithms.contract import Estimator
 from ..recording import Recording
+from ..recording import open as open_recording
 from ..recording.errors import OutputExists, UsageError
 from .clock import Clock
 from .engine import Engine, Progress, ReplayResult, Run
-from .evaluate import evaluate_run, recording_view
+from .evaluate import evaluate, evaluate_run, recording_view
 from .feed import GapPolicy
 from .plan import EstimatorSpec, plan_runs
 from .sinks import RecordingSink, Sink, TableSink
@@ -36,6 +37,7 @@ def replay(
     gap: GapPolicy | str | None = None,
     sinks: Sequence[Sink] = (),
     keep_tables: bool = True,
+    metrics: bool = True,
     clock: Clock | None = None,
     progress: Progress | None = None,
     max_rows: int = 65_536,
@@ -70,6 +72,8 @@ def replay(
     keep_tables : bool
         Keep the results in memory (``result.runs[i].tables``). Without it memory does not grow with the
         length, and metrics are measured only where ``out`` is given (from there).
+    metrics : bool
+        Measure the runs.
     clock : Clock, optional
         Paces the replay.
     progress : callable, optional
@@ -115,8 +119,9 @@ def replay(
             if tables is not None:
                 kept = {name: tables.table(topic) for name, topic in run.outputs.items()}
                 run.tables = {name: t for name, t in kept.items() if t is not None}
-                view = recording_view(rec, run.lineage, run.tables, start_ns, end_ns)
-                run.metrics = evaluate_run(view).metrics
+                if metrics:
+                    view = recording_view(rec, run.lineage, run.tables, start_ns, end_ns)
+                    run.metrics = evaluate_run(view).metrics
 
     engine = Engine(
         source,
@@ -134,13 +139,12 @@ def replay(
     with engine:
         engine.play()
         result = engine.finish(complete)
-    if target is not None and tables is None:
-        from ..recording import open as open_recording
-        from .evaluate import evaluate
-
-        measured = {r.run: r.metrics for r in evaluate(open_recording(target)).runs}
+    if target is not None and tables is None and metrics:
+        with open_recording(target) as written:
+            found = evaluate(written, runs=[r.run for r in result.runs], intervals=False)
+        measured = {r.run: r.metrics for r in found.runs}
         for run in result.runs:
-            run.metrics = measured.get(run.run, {})
+            run.metrics = measured[run.run]
     return result
 
 

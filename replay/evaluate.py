@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import msgspec
 import polars as pl
@@ -185,11 +185,16 @@ def recording_view(
     """
     run = lineage["run"]
 
-    def output(name: str) -> pl.DataFrame | None:
+    def output(name: str, columns: Sequence[str] | None) -> pl.DataFrame | None:
         if tables is not None:
-            return tables.get(name)
+            table = tables.get(name)
+            return table if columns is None or table is None else _some(table, columns)
         topic = f"/estimate/{run}/{name}"
-        return rec.table(topic) if rec is not None and topic in rec.channels else None
+        if rec is None or topic not in rec.channels:
+            return None
+        if columns is None or not rec.channels[topic].count:
+            return rec.table(topic)
+        return pl.concat([_some(w.tables[topic], columns) for w in rec.windows([topic])])
 
     start_ns = start_ns if start_ns is not None else _number(lineage.get("range.start_ns"))
     end_ns = end_ns if end_ns is not None else _number(lineage.get("range.end_ns"))
@@ -281,6 +286,10 @@ def truth_of(records: Mapping[str, Mapping[str, str]]) -> Truth:
     except ValueError:
         raise MarchaError(f"metadata record truth: length_m {record['length_m']!r} is no number") from None
     return Truth({"true": True, "false": False}.get(closed), length)
+
+
+def _some(table: pl.DataFrame, columns: Sequence[str]) -> pl.DataFrame:
+    return table.select("t_ns", *(c for c in columns if c in table.columns))
 
 
 def _measure(view: RunView) -> dict[str, float]:

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from importlib import metadata
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -24,7 +25,7 @@ POSITION = ("pos_x", "pos_y", "pos_z")
 QUATERNION = ("quat_w", "quat_x", "quat_y", "quat_z")
 VELOCITY = ("vel_x", "vel_y", "vel_z")
 Metric = Callable[["RunView"], Mapping[str, float]]
-Loader = Callable[[str], "pl.DataFrame | None"]
+Loader = Callable[[str, "Sequence[str] | None"], "pl.DataFrame | None"]
 
 
 @dataclass(frozen=True)
@@ -58,15 +59,17 @@ def track_of(table: pl.DataFrame | None) -> Track | None:
     """Return the usable rows of a pose table, in time order, or None where there are none."""
     if table is None or not set(POSITION) <= set(table.columns):
         return None
-    has_quat = set(QUATERNION) <= set(table.columns)
-    columns = [*POSITION, *(QUATERNION if has_quat else ())]
-    table = table.select("t_ns", *columns).filter(pl.all_horizontal(pl.col(POSITION).is_finite()))
-    table = table.sort("t_ns", maintain_order=True).unique("t_ns", keep="first", maintain_order=True)
+    finite = pl.all_horizontal(pl.col(POSITION).is_finite())
+    if not table.select(finite.all()).item():
+        table = table.filter(finite)
+    if not table["t_ns"].is_sorted() or table["t_ns"].is_duplicated().any():
+        table = table.sort("t_ns", maintain_order=True).unique("t_ns", keep="first", maintain_order=True)
     if table.is_empty():
         return None
-    values = table.select(columns).to_numpy()
-    quat = values[:, 3:] if has_quat and np.isfinite(values[:, 3:]).all() else None
-    return Track(table["t_ns"].to_numpy(), np.ascontiguousarray(values[:, :3]), quat)
+    quat = table.select(QUATERNION).to_numpy() if set(QUATERNION) <= set(table.columns) else None
+    if quat is not None and not np.isfinite(quat).all():
+        quat = None
+    return Track(table["t_ns"].to_numpy(), table.select(POSITION).to_numpy(order="c"), quat)
 
 
 @dataclass(frozen=True)
@@ -130,7 +133,8 @@ class RunView:
     lineage : mapping
         The metadata record ``run/<id>``.
     output : callable
-        ``output("pose")`` is the table of that output, None where the run has none.
+        ``output("pose", columns)`` is the table of that output with ``t_ns`` and those of ``columns``
+        (None: all) that it has; None where the run does not have the output.
     truth : Truth
         What is known of the walk.
     reference, reference_velocity : polars.DataFrame or None
@@ -154,13 +158,13 @@ class RunView:
     max_gap_s: float = 0.1
     start_ns: int | None = None
     end_ns: int | None = None
-    _cache: dict[str, pl.DataFrame | None] = field(default_factory=dict, repr=False)
+    _cache: dict[Any, pl.DataFrame | None] = field(default_factory=dict, repr=False)
 
-    def table(self, name: str) -> pl.DataFrame | None:
-        """Return an output's table within the interval."""
-        if name not in self._cache:
-            self._cache[name] = self.output(name)
-        return self._within(self._cache[name])
+    def table(self, name: str, columns: tuple[str, ...] | None = None) -> pl.DataFrame | None:
+        """Return an output's table within the interval; naming ``columns`` saves memory."""
+        if (name, columns) not in self._cache:
+            self._cache[name, columns] = self.output(name, columns)
+        return self._within(self._cache[name, columns])
 
     def _within(self, table: pl.DataFrame | None) -> pl.DataFrame | None:
         if table is None or (self.start_ns is None and self.end_ns is None):
@@ -178,7 +182,8 @@ class RunView:
     @cached_property
     def track(self) -> Track | None:
         """The estimated track."""
-        return track_of(self.table("pose"))
+        headings = QUATERNION if self.reference is not None else ()
+        return track_of(self.table("pose", (*POSITION, *headings)))
 
     @cached_property
     def reference_track(self) -> Track | None:
@@ -269,7 +274,9 @@ def distance(view: RunView) -> dict[str, float]:
 
 def _length(position: FloatArray) -> float:
     """Return the horizontal length of a polygon."""
-    return float(np.hypot(*np.diff(position[:, :2], axis=0).T).sum())
+    block = 1_000_000  # the differences of a long walk need not lie in memory together
+    starts = range(0, max(1, len(position) - 1), block)
+    return float(sum(np.hypot(*np.diff(position[i : i + block + 1, :2], axis=0).T).sum() for i in starts))
 
 
 def height(view: RunView) -> dict[str, float]:

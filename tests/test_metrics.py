@@ -40,7 +40,7 @@ def pose(t_s: Any, position: Any, yaw: Any = None) -> pl.DataFrame:
 
 
 def view(tables: dict[str, pl.DataFrame], **options: Any) -> RunView:
-    return RunView("run", "estimator", {}, tables.get, **options)
+    return RunView("run", "estimator", {}, lambda name, _: tables.get(name), **options)
 
 
 SQUARE = [[0, 0, 0], [3, 0, 0], [3, 4, 0.5], [0.3, 0.4, 1.0]]
@@ -325,7 +325,7 @@ def test_every_metric_is_registered() -> None:
     ],
 )
 def test_a_run_that_must_not_be_used_is_said_not_measured(lineage: dict[str, str], said: str) -> None:
-    run = RunView("run", "estimator", lineage, {"pose": pose(range(4), SQUARE)}.get)
+    run = RunView("run", "estimator", lineage, lambda name, _: {"pose": pose(range(4), SQUARE)}.get(name))
     found = evaluate_run(run)
     assert found.metrics == {}
     assert said in found.note

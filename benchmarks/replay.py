@@ -1,0 +1,132 @@
+"""Replay: foot.9iez through the engine, beside a plain NumPy filter and vqf; memory."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import marcha.recording as mr
+import numpy as np
+import polars as pl
+from marcha.ingest.simulate import walk
+from marcha.replay import replay
+
+from . import Row
+
+IMU = "sensor_msgs/msg/Imu"
+COLUMNS = ("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z")
+SAMPLES = 1_000_000
+PLAIN_SAMPLES = 20_000
+PER_SAMPLE, IN_BLOCKS, MEMORY_MB = 150_000, 1_500_000, 400
+
+
+def rows(scale: float) -> list[Row]:
+    """Measure; ``scale`` 1 replays 1,000,000 samples."""
+    n = max(20_000, int(SAMPLES * scale))
+    with tempfile.TemporaryDirectory() as folder:
+        small, large = Path(folder, "walk.mcap"), Path(folder, "long.mcap")
+        readings = _recording(small, n)
+        run: Callable[..., Any] = lambda **o: replay(mr.open(small), ["foot.9iez"], **o)  # noqa: E731
+        run(end_ns=10**9)  # compile
+        run(end_ns=10**9, mode="sample")
+        kept = n / _best(lambda: run())
+        out = Path(folder, "out.mcap")
+        blocks = n / _best(lambda: _written(run, out))
+        single = n / _best(lambda: run(mode="sample"))
+        written = n / _best(lambda: _written(run, out, mode="sample"), 1)
+        plain = PLAIN_SAMPLES / _best(lambda: _plain_filter(readings[:PLAIN_SAMPLES]))
+        vqf = n / _best(lambda: _vqf(readings))
+        _recording(large, 4 * n)
+        growth = _peak_mb(large) - _peak_mb(small)
+    numpy_loop = "9-state filter in plain NumPy, no files"
+    return [
+        _rate("replay per sample, results in memory", single, numpy_loop, plain, PER_SAMPLE),
+        _rate("replay per sample, results in a recording", written, numpy_loop, plain, PER_SAMPLE),
+        _rate("replay in blocks, results in memory", kept, "vqf (C++), orientation only, no files", vqf, IN_BLOCKS),
+        _rate("replay in blocks, results in a recording", blocks, numpy_loop, plain, IN_BLOCKS),
+        Row(
+            f"memory of a recorded replay, {4 * n:,} samples above {n:,}", growth, "MB", "", None, None,
+            f"< {MEMORY_MB} MB", growth < MEMORY_MB,
+        ),
+    ]  # fmt: skip
+
+
+def _rate(name: str, ours: float, peer: str, theirs: float, target: float) -> Row:
+    return Row(name, ours, "samples/s", peer, theirs, ours / theirs, f"≥ {target:,}/s", ours >= target)
+
+
+def _recording(path: Path, n: int) -> np.ndarray:
+    """Write ``n`` samples of a simulated walk; return them."""
+    source = walk("rectangle", seed=1, duration_s=n / 100 + 10)
+    readings = np.hstack(source.measured())[:n]
+    table = {"t_ns": source.t_ns[:n]} | {c: readings[:, i].copy() for i, c in enumerate(COLUMNS)}
+    with mr.create(path) as out:
+        out.add_table("/foot/imu1", IMU, pl.DataFrame(table), frame_id="imu1")
+    return readings
+
+
+def _written(run: Callable[..., Any], path: Path, **options: Any) -> None:
+    run(out=path, overwrite=True, **options)
+
+
+def _best(task: Callable[[], Any], times: int = 3) -> float:
+    """Return the shortest of a few runs in seconds."""
+    best = float("inf")
+    for _ in range(times):
+        begin = time.perf_counter()
+        task()
+        best = min(best, time.perf_counter() - begin)
+    return best
+
+
+def _plain_filter(readings: np.ndarray, dt: float = 0.01) -> None:
+    """The error-state filter as one writes it in NumPy: 9 states, C1&C2&C3, zero-velocity updates."""
+    eye3, eye9, gravity = np.eye(3), np.eye(9), np.array([0.0, 0.0, -9.81])
+    rot, v, p, cov = np.eye(3), np.zeros(3), np.zeros(3), np.zeros((9, 9))
+    q = np.diag([1e-4] * 3 + [0.0] * 3 + [1e-2] * 3) * dt * dt
+    h, r = np.hstack((np.zeros((3, 6)), eye3)), 1e-4 * eye3
+    norms = np.linalg.norm(readings[:, :3], axis=1)
+    for k, row in enumerate(readings):
+        f, w = row[:3], row[3:]
+        rot = rot @ (2 * eye3 + _skew(w) * dt) @ np.linalg.inv(2 * eye3 - _skew(w) * dt)
+        force = rot @ f
+        v = v + (force + gravity) * dt
+        p = p + v * dt
+        transition = eye9.copy()
+        transition[3:6, 6:9] = eye3 * dt
+        transition[6:9, 0:3] = -_skew(force) * dt
+        cov = transition @ cov @ transition.T + q
+        if 9 < norms[k] < 11 and norms[max(0, k - 9) : k + 1].var() < 3 and np.linalg.norm(w) < 0.6:
+            gain = cov @ h.T @ np.linalg.inv(h @ cov @ h.T + r)
+            delta = gain @ v
+            keep = eye9 - gain @ h
+            cov = keep @ cov @ keep.T + gain @ r @ gain.T
+            v, p = v - delta[6:], p - delta[3:6]
+            rot = (2 * eye3 - _skew(delta[:3])) @ np.linalg.inv(2 * eye3 + _skew(delta[:3])) @ rot
+
+
+def _skew(w: np.ndarray) -> np.ndarray:
+    return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+
+
+def _vqf(readings: np.ndarray) -> None:
+    from vqf import VQF
+
+    VQF(0.01).updateBatch(np.ascontiguousarray(readings[:, 3:]), np.ascontiguousarray(readings[:, :3]))
+
+
+def _peak_mb(path: Path) -> float:
+    """Return the peak memory of a process that replays a recording into another one."""
+    code = (
+        "import resource, sys, marcha.recording as mr; from marcha.replay import replay\n"
+        "replay(mr.open(sys.argv[1]), ['foot.9iez'], out=sys.argv[1] + '.out', overwrite=True, keep_tables=False,"
+        " metrics=False)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
+    return float(done.stdout)
