@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import marcha.recording as mr
 import numpy as np
 import polars as pl
-
-import marcha.recording as mr
 
 STEP_NS = 10_000_000
 

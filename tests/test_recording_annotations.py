@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 
+import marcha.recording as mr
 import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.reader import make_reader
-from mcap_ros2.decoder import DecoderFactory
-
-import marcha.recording as mr
 from marcha.recording.integrity import structure
 from marcha.recording.provenance import hash_file, provenance, sources_of
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from .recording_samples import imu, sample_table, write
 

@@ -8,9 +8,8 @@ import subprocess
 import sys
 import textwrap
 
-import pytest
-
 import marcha.recording as mr
+import pytest
 from marcha.recording import atomic
 
 from .recording_samples import imu, write
@@ -51,10 +50,10 @@ def test_an_existing_file_is_kept_without_overwrite(tmp_path):
 def test_overwrite_replaces_only_at_the_end(tmp_path):
     path = write(tmp_path / "a.mcap", {"/imu": (IMU, imu(5))})
     before = path.read_bytes()
-    with pytest.raises(ValueError), mr.create(path, overwrite=True) as out:
-        out.add_table("/imu", IMU, imu(9))
-        assert path.read_bytes() == before
-        raise ValueError
+    out = mr.create(path, overwrite=True)
+    out.add_table("/imu", IMU, imu(9))
+    assert path.read_bytes() == before
+    out.abort()
     assert path.read_bytes() == before
     write(path, {"/imu": (IMU, imu(9))}, overwrite=True)
     assert mr.open(path).channels["/imu"].count == 9
@@ -62,9 +61,11 @@ def test_overwrite_replaces_only_at_the_end(tmp_path):
 
 def test_a_file_that_appears_meanwhile_is_kept(tmp_path):
     path = tmp_path / "a.mcap"
-    with pytest.raises(mr.OutputExists), mr.create(path) as out:
-        out.add_table("/imu", IMU, imu(5))
-        path.write_text("somebody else's")
+    out = mr.create(path)
+    out.add_table("/imu", IMU, imu(5))
+    path.write_text("somebody else's")
+    with pytest.raises(mr.OutputExists):
+        out.close()
     assert path.read_text() == "somebody else's"
     assert len(list(tmp_path.iterdir())) == 1
 
@@ -98,16 +99,17 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(tmp_path, monkeypatch, when)
         def __getattr__(self, name):
             return full if name == when else getattr(self._file, name)
 
-    with (
-        pytest.raises(mr.MarchaError, match=r"a\.mcap: cannot write: No space left"),
-        mr.create(tmp_path / "a.mcap") as out,
-    ):
-        if when == "fsync":
-            monkeypatch.setattr(atomic.os, "fsync", full)
-        else:
-            inner = out._file._file
-            inner._file = Full(inner._file)  # pyright: ignore[reportAttributeAccessIssue]
-        out.add_table("/imu", IMU, imu(9000))
+    def attempt():
+        with mr.create(tmp_path / "a.mcap") as out:
+            if when == "fsync":
+                monkeypatch.setattr(atomic.os, "fsync", full)
+            else:
+                inner = out._file._file
+                inner._file = Full(inner._file)  # pyright: ignore[reportAttributeAccessIssue]
+            out.add_table("/imu", IMU, imu(9000))
+
+    with pytest.raises(mr.MarchaError, match=r"a\.mcap: cannot write: No space left"):
+        attempt()
     assert list(tmp_path.iterdir()) == []
 
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.reader import make_reader
-from .recording_samples import sample_table, write
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
 from marcha.recording import SCHEMAS
 from marcha.recording.cdr import CdrError, decode, encode, layout_of_message
 from marcha.recording.definitions import PRIMITIVES, Definition, Field, full_text, load, long_name, parse_full
+from mcap.reader import make_reader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from .recording_samples import sample_table, write
 
 
 def store_for(*names: str):
@@ -53,7 +54,7 @@ def test_padding_behind_every_length_of_frame_id(frame_id):
     }
     raw = encode(value, definition, library)
     store = store_for()
-    theirs = store.deserialize_cdr(raw, "sensor_msgs/msg/Imu")
+    theirs: Any = store.deserialize_cdr(raw, "sensor_msgs/msg/Imu")
     assert theirs.header.frame_id == frame_id
     assert bytes(store.serialize_cdr(theirs, "sensor_msgs/msg/Imu")) == raw
     assert decode(raw, definition, library) == value

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
 from marcha.recording import SCHEMAS, MarchaError
 from marcha.recording.definitions import full_text, known_types, load, long_name, parse, parse_full
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 
@@ -15,7 +14,7 @@ JAZZY = get_typestore(Stores.ROS2_JAZZY)
 def test_equals_the_jazzy_definition(name):
     ours = get_types_from_msg(full_text(name), long_name(name))[long_name(name)]
     constants, fields = JAZZY.fielddefs[long_name(name)]
-    assert [f for f in ours[1]] == fields
+    assert list(ours[1]) == fields
     assert sorted(ours[0]) == sorted(constants)
 
 
@@ -45,7 +44,8 @@ def test_every_column_has_a_field(schema):
 
 
 def test_bounds_defaults_constants_and_comments():
-    text = "# head\nuint8 A=1 # one\nstring<=5 name 'x # y'\nfloat32[<=3] few\nint16[2] pair [1, 2]\nHeader header\n"
+    text = "# head\nuint8 A=1 # one\nstring<=5 name 'x # y'\nfloat32[<=3] few\n"
+    text += "int16[2] pair [1, 2]\nHeader header\n"
     definition = parse("pkg/msg/Odd", text)
     assert [(f.name, f.type, f.length) for f in definition.fields] == [
         ("name", "string", None),

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import json
 
+import marcha.recording as mr
 import numpy as np
 import polars as pl
 import pytest
+from marcha.recording.cdr import encode
+from marcha.recording.definitions import full_text, load, parse_full
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_ros2.writer import Writer as Ros2Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, get_typestore
-
-import marcha.recording as mr
-from marcha.recording.cdr import encode
-from marcha.recording.definitions import full_text, load, parse_full
 
 from .recording_samples import imu
 
@@ -220,7 +219,7 @@ def test_a_json_channel_is_listed_and_skipped_with_a_finding(tmp_path):
     assert (rec.channels["/json"].count, rec.channels["/json"].columns) == (5, ())
     assert rec.table("/imu").equals(table)
     assert {m.topic for m in rec.messages()} == {"/imu"}
-    with pytest.raises(mr.MarchaError, match="/json.*cannot be read"):
+    with pytest.raises(mr.MarchaError, match=r"/json.*cannot be read"):
         rec.table("/json")
     with pytest.raises(mr.MarchaError, match="only cdr"), mr.create(tmp_path / "b.mcap") as out:
         out.copy_from(rec)

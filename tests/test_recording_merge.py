@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import marcha.recording as mr
 import numpy as np
 import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-import marcha.recording as mr
 from marcha.recording import mcapfile, writer
 
 from .recording_samples import imu

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import struct
 
+import marcha.recording as mr
 import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mcap.opcode import Opcode
-
-import marcha.recording as mr
 from marcha.recording.check import check
 from marcha.recording.integrity import structure
+from mcap.opcode import Opcode
 
 from .recording_samples import imu, sample_table
 
@@ -65,13 +64,11 @@ def open_cut(tmp_path, data: bytes):
 def test_cut_anywhere_gives_a_prefix(whole, tmp_path, part):
     cut = len(whole) * part // 60 + 13
     path = open_cut(tmp_path, whole[:cut])
-    try:
-        tables = read_all(path)
-    except mr.MarchaError as e:
-        assert cut < 4000  # not even the first channel
-        assert "\n" not in str(e)
-        assert str(path) in str(e)
+    if part == 0:  # not even the first channel
+        with pytest.raises(mr.MarchaError, match="no channel can be read"):
+            mr.open(path)
         return
+    tables = read_all(path)
     got = tables.get("/imu", TABLE[:0])
     assert got.equals(TABLE[: got.height])
     ends = [at + n for at, opcode, n in records(whole) if opcode == Opcode.CHUNK]

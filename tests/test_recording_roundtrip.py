@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import marcha.recording as mr
 import numpy as np
 import polars as pl
 import pytest
@@ -11,8 +12,6 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
-
-import marcha.recording as mr
 
 from .recording_samples import STEP_NS, imu, sample_table, write
 
@@ -89,6 +88,7 @@ def check_decoded(schema: str, table: pl.DataFrame, row: int, message) -> None:
         elif kind == "sigma":
             got = math.sqrt(got)
         if isinstance(value, float) and math.isnan(value):
+            assert isinstance(got, float), path
             assert math.isnan(got), path
         else:
             assert got == value, path
