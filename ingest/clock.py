@@ -119,6 +119,8 @@ class Clock:
             frame, ticks = self._drop_repeats(frame, ticks)
         if frame.height:
             self._measure(frame, ticks)
+            if self._shift:
+                self._report.repaired += int(np.count_nonzero(frame["t"].to_numpy() != ticks))
             self._last = int(ticks[-1])
             self._last_row = frame.drop("t", "line").row(-1)
         if final:
@@ -191,7 +193,7 @@ class Clock:
                         "backwards_time",
                         f"{self._subject}the clock steps back by {self._text(last - int(ticks[a]))} and "
                         f"runs on from there: all rows from here on moved by {self._text(move)}",
-                        rows=ticks.size - a,
+                        rows=0,  # counted as they are handed out
                         line=lines[a],
                         subject=self._subject + "restart",
                     )

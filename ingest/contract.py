@@ -297,7 +297,10 @@ class Importer(Protocol):
 
     name: ClassVar[str]
     title: ClassVar[str]
-    Options: ClassVar[type[CommonOptions]]
+
+    @property
+    def Options(self) -> type[CommonOptions]:  # noqa: D102 - a class attribute, described above
+        ...
 
     def sniff(self, head: bytes, path: Path) -> float:
         """Tell how surely this is the format, from content.

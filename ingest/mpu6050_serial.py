@@ -28,10 +28,9 @@ LIMITS = ((0, 2**32 - 1), *[(-32768, 32767)] * 12)
 #: Steps of a believable time column, ms.
 STEP_MS = (0, 1000)
 
-_ROW = re.compile(
-    rb"\s*(?:(?:[\d/.-]{10}[ T])?\d\d:\d\d:\d\d(?:[.,:]\d+)?[\s>-]+)?"  # a terminal's wall clock
-    rb"(\d+)(?:(?:[ \t]*[,;][ \t]*|[ \t]+)[+-]?\d+){12}[\s,;]*"
-)
+_WALL = rb"\s*(?:(?:[\d/.-]{10}[ T])?\d\d:\d\d:\d\d(?:[.,:]\d+)?(?:[\s>-]+|$))?"  # a terminal's wall clock
+_BLANK = re.compile(_WALL + rb"\s*")
+_ROW = re.compile(_WALL + rb"(\d+)(?:(?:[ \t]*[,;][ \t]*|[ \t]+)[+-]?\d+){12}[\s,;]*")
 
 
 class Mpu6050Serial:
@@ -44,9 +43,7 @@ class Mpu6050Serial:
 
     def sniff(self, head: bytes, path: Path) -> float:
         """Rows of 13 whole numbers whose first grows like milliseconds."""
-        if not head or b"\x00" in head:
-            return 0.0
-        lines = [line for line in re.split(rb"[\r\n]+", head) if line.strip()]
+        lines = [line for line in re.split(rb"[\r\n]+", head) if not _BLANK.fullmatch(line)]
         lines = lines[:-1] if len(lines) > 1 and len(head) >= HEAD_BYTES else lines  # the last may be cut
         times = [int(m[1]) for line in lines if (m := _ROW.fullmatch(line))]
         if len(times) < 2 or 2 * len(times) < len(lines):

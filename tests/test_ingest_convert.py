@@ -252,6 +252,20 @@ def test_same_bytes_twice(walk: Path, tmp_path: Path) -> None:
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
 
 
+@pytest.mark.data
+def test_real_recordings_convert_whole(data_dir: Path, tmp_path: Path) -> None:
+    """Every file of the shoe's device: two messages a row, exit-code class as the data's README says."""
+    files = sorted((data_dir / "foot" / "mpu6050").glob("conf-*.csv"))
+    assert len(files) == 7
+    for file in files:
+        done = convert(file, tmp_path / f"{file.stem}.mcap")
+        assert sum(c.count for c in done.channels) == 2 * rows_of(file)
+        assert done.report.rows_dropped == done.report.rows_repaired == 0
+        assert done.report.lossy == (file.name[5:9] in ("0000", "0303", "3030"))
+    with pytest.raises(MarchaError, match="holds 7 recordings"):
+        convert(files[0].parent, tmp_path / "all.mcap")
+
+
 def test_formats_document_their_options() -> None:
     known = {f.name: f for f in formats()}
     assert {"mpu6050-serial", "mpu6050-packets", "table"} <= set(known)

@@ -114,7 +114,7 @@ def test_boot_chatter_is_named_not_counted(tmp_path: Path) -> None:
 def test_wall_clock_becomes_metadata(tmp_path: Path) -> None:
     rows = [b"12:34:%02d.%03d " % (56 + i // 100, i % 100 * 10) + line(i) for i in range(150)]
     path = write(tmp_path, b"\r\n12:34:56.789 \r\n".join(rows) + b"\r\n")
-    assert Mpu6050Serial().sniff(path.read_bytes(), path) > 0.4
+    assert Mpu6050Serial().sniff(path.read_bytes(), path) > 0.9
     tables, report, metadata = read(path)
     assert tables["/foot/imu1"].height == 150
     assert report.findings == []
