@@ -47,7 +47,7 @@ def rows(scale: float) -> list[Row]:
     return [
         _rate("replay per sample, results in memory", single, numpy_loop, plain, PER_SAMPLE),
         _rate("replay per sample, results in a recording", written, numpy_loop, plain, PER_SAMPLE),
-        _rate("replay in blocks, results in memory", kept, "vqf (C++), orientation only, no files", vqf, IN_BLOCKS),
+        _rate("replay in blocks, results in memory", kept, "vqf (C++), orientation only", vqf, IN_BLOCKS),
         _rate("replay in blocks, results in a recording", blocks, numpy_loop, plain, IN_BLOCKS),
         Row(
             f"memory of a recorded replay, {4 * n:,} samples above {n:,}", growth, "MB", "", None, None,
@@ -124,8 +124,8 @@ def _peak_mb(path: Path) -> float:
     """Return the peak memory of a process that replays a recording into another one."""
     code = (
         "import resource, sys, marcha.recording as mr; from marcha.replay import replay\n"
-        "replay(mr.open(sys.argv[1]), ['foot.9iez'], out=sys.argv[1] + '.out', overwrite=True, keep_tables=False,"
-        " metrics=False)\n"
+        "replay(mr.open(sys.argv[1]), ['foot.9iez'], out=sys.argv[1] + '.out', overwrite=True,"
+        " keep_tables=False, metrics=False)\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)\n"
     )
     done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
