@@ -26,11 +26,11 @@ def convert(
     """Turn raw logs into recordings and report every defect.
 
     With -o FILE.mcap, all inputs together become one recording. With -o
-    FOLDER/ (a trailing slash, or a folder that exists), each input becomes
-    FOLDER/<its name>.mcap; an input that is a folder of logs stands for each
-    log in it whose format is recognised, the others are named as skipped.
-    There, a file that fails does not stop the others; the exit code is the
-    worst of all.
+    FOLDER/ (a trailing slash, or a folder that exists), each input becomes a
+    recording of its own name there; an input that is a folder of logs stands
+    for each log in it whose format is recognised, the others are named as
+    skipped. There, a file that fails does not stop the others; the exit code
+    is the worst of all.
 
     Parameters
     ----------

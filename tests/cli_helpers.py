@@ -32,10 +32,11 @@ class Ran:
 
     @property
     def complaint(self) -> str:
-        """The one line on standard error."""
-        assert self.err.startswith("marcha: "), self.err
-        assert self.err.count("\n") == 1, self.err
-        return self.err.removeprefix("marcha: ").rstrip()
+        """The one line on standard error, beside warnings of plug-ins."""
+        lines = [line for line in self.err.splitlines() if not line.startswith("marcha: warning: ")]
+        assert len(lines) == 1, self.err
+        assert lines[0].startswith("marcha: "), self.err
+        return lines[0].removeprefix("marcha: ")
 
 
 def marcha(*arguments: object) -> Ran:

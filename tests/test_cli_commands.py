@@ -5,10 +5,9 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import marcha.recording as mr
 import polars as pl
 import pytest
-
-import marcha.recording as mr
 
 from .cli_helpers import marcha
 

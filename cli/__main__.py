@@ -1,0 +1,9 @@
+"""``python -m marcha.cli``."""
+
+from __future__ import annotations
+
+import sys
+
+from .app import main
+
+sys.exit(main())
