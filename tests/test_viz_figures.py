@@ -35,7 +35,7 @@ def done(raw: mr.Recording) -> mr.Recording:
 def test_the_plan_shows_every_run_and_the_reference_with_equal_axes(done: mr.Recording) -> None:
     figure = viz.figure(done)
     plan = next(ax for ax in figure.axes if ax.get_title(loc="left").startswith("from above"))
-    labels = [t.get_text() for t in plan.get_legend().get_texts()]
+    labels = [t.get_text() for part in figure.subfigs for legend in part.legends for t in legend.get_texts()]
     assert labels == ["reference", RUN, "foot_naive_foot_imu1", "start", "end"]
     assert plan.get_aspect() == 1.0
     assert (plan.get_xlabel(), plan.get_ylabel()) == ("x (m)", "y (m)")

@@ -16,7 +16,7 @@ from .track import Track
 CLOSED_M = 1.0
 """Start and end closer than this have one label."""
 
-FAR_ABOVE = 10.0
+FAR_ABOVE = 5.0
 """A statistic that rises more than so many times above its threshold is shown up to there: else the threshold is at zero."""
 
 
@@ -139,9 +139,7 @@ class Pose(Artist):
             self.scene.tracks[self.base] = self.track
         self.zero: Floats | None = None
         self.scene.lines(f"{self.base}/height", [self.owner], [self.color])
-        self.scene.static(
-            f"{self.base}/trail", rr.Points3D.from_fields(colors=style.rgb(self.color), radii=rr.Radius.ui_points(2.0))
-        )
+        self._points(2.0)
         self.turns = set(self.QUATERNION) <= set(self.channel.columns)
         if self.turns:
             self.scene.static(f"{self.base}/foot", rr.TransformAxes3D(0.3))
@@ -177,6 +175,8 @@ class Pose(Artist):
             f"{self.base}/track",
             rr.LineStrips3D([line], colors=color, radii=rr.Radius.ui_points(1.0)),
         )
+        if self.track.sparse:
+            self._points(7.0)
         owners = list(self.scene.tracks) if self.base in self.scene.tracks else [self.base]
         # names stand at different places of the walk, so that those of several runs do not cover each other
         at = len(line) * (owners.index(self.base) + 1) // (len(owners) + 1)
@@ -192,6 +192,11 @@ class Pose(Artist):
                 show_labels=True,
             ),
         )
+
+    def _points(self, radius: float) -> None:
+        """Style the trail."""
+        points = rr.Points3D.from_fields(colors=style.rgb(self.color), radii=rr.Radius.ui_points(radius))
+        self.scene.static(f"{self.base}/trail", points)
 
 
 class Stance(Artist):

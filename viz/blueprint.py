@@ -129,7 +129,7 @@ def _space(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Spatial3DVi
 
 def _plan(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Spatial2DView:
     """Return the 2D view of all tracks from above."""
-    bounds = [-0.1 * plan.PIXELS, 1.1 * plan.PIXELS]  # the grid reaches beyond the camera's picture
+    bounds = [0.0, plan.PIXELS]
     return rrb.Spatial2DView(
         origin=plan.CAMERA,
         contents=[*_spatial(entries), plan.GRID, plan.TICKS],
@@ -173,7 +173,7 @@ def _overview(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Containe
     lanes = _lanes(entries)
     plots: list[rrb.View] = [*_height(scenes, entries), *lanes]
     plots += [_plot(e.title, [e]) for e in _norms(scenes, entries)]
-    shares = [0.4 + 0.16 * len(_of(entries, "stance", "annotation")) if p in lanes else 1.0 for p in plots]
+    shares = [0.4 + 0.19 * len(_of(entries, "stance", "annotation")) if p in lanes else 1.0 for p in plots]
     if not _of(entries, "track", "map"):
         return rrb.Vertical(*plots, row_shares=shares, name="Overview") if plots else None
     left: list[rrb.View] = []
@@ -221,7 +221,7 @@ def _detector(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Containe
     ]
     top = rrb.Horizontal(*runs) if len(runs) <= 3 else rrb.Tabs(*runs)
     lanes = _lanes(entries)
-    shares = [3.0, *[0.4 + 0.16 * len(_of(entries, "stance", "annotation"))] * len(lanes)]
+    shares = [3.0, *[0.4 + 0.19 * len(_of(entries, "stance", "annotation"))] * len(lanes)]
     return rrb.Vertical(top, *lanes, row_shares=shares, name="Detector")
 
 

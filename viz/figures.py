@@ -64,7 +64,7 @@ def figure(recs: Recording | Sequence[Recording], *, alignment: str = ALIGNMENT)
     for row, scene in zip(np.atleast_1d(fig.subfigures(len(scenes), 1)), scenes, strict=True):
         row.suptitle(scene.rec.path.stem, fontsize=11, fontweight="bold")
         plan, *others = row.subplots(1, 3 if scene.with_errors else 2)
-        _plan(plan, scene, legend=False)
+        _plan(plan, scene)
         for ax, draw in zip(others, (_heights, _errors), strict=False):
             _time(ax, draw, scene)
             ax.set_xlabel("time since the start (s)", fontsize=9)
@@ -168,6 +168,7 @@ def _scene(rec: Recording, alignment: str) -> _Scene:
         result = compare(track, reference, alignment) if reference is not None else None
         if result is not None:
             track.place, compared[run] = result.place, result
+            track.worst_m = result.worst_m
     return _Scene(rec, tracks, reference, compared, alignment)
 
 
@@ -178,7 +179,9 @@ def _one(fig: Figure, scene: _Scene) -> None:
     panels = [_signals]
     if scene.shown:
         left, signals = fig.subfigures(1, 2, width_ratios=[1.0, 1.1])
-        _plan(left.subplots(), scene)
+        ax = left.subplots()
+        _plan(ax, scene)
+        left.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
         panels = [_heights, _signals, *([_errors] if scene.with_errors else [])]
     axes = signals.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for draw, ax in zip(panels, axes, strict=True):
@@ -205,8 +208,9 @@ def _label(ax: Axes, title: str, y: str) -> None:
 
 def _line(track: Track, scene: _Scene) -> dict[str, Any]:
     """Return how a track's line looks: the reference lies wide and pale under the runs."""
-    wide = track is scene.reference
-    return {"color": track.color, "linewidth": 3.0 if wide else 1.4, "alpha": 0.6 if wide else 1.0}
+    if track is not scene.reference:
+        return {"color": track.color, "linewidth": 1.4}
+    return {"color": track.color, "linewidth": 3.0, "alpha": 0.6, "marker": "o" if track.sparse else ""}
 
 
 def _key(track: Track, scene: _Scene) -> Any:
@@ -215,7 +219,7 @@ def _key(track: Track, scene: _Scene) -> Any:
     return Line2D([], [], **_line(track, scene))
 
 
-def _plan(ax: Axes, scene: _Scene, *, legend: bool = True) -> None:
+def _plan(ax: Axes, scene: _Scene) -> None:
     """Draw all tracks from above, with equal axes, start and end marked."""
     for track in scene.shown:
         x, y = _thin(*track.shown[:, :2].T)
@@ -234,15 +238,13 @@ def _plan(ax: Axes, scene: _Scene, *, legend: bool = True) -> None:
     ax.set_axisbelow(True)
     _label(ax, f"from above{f' (alignment {scene.alignment})' if scene.compared else ''}", "y (m)")
     ax.set_xlabel("x (m)", fontsize=9)
-    if legend:
-        ax.legend(fontsize=8, framealpha=0.9, loc="upper center", bbox_to_anchor=(0.5, -0.09), ncols=2)
 
 
 def _heights(ax: Axes, scene: _Scene) -> None:
     for track in scene.shown:
-        t, z = _thin(scene.seconds(track.t_ns), track.positions[:, 2])
+        t, z = _thin(scene.seconds(track.t_ns), track.shown[:, 2])
         ax.plot(t, z, color=track.color, linewidth=1.0)
-    z = np.concatenate([t.positions[:, 2] for t in framed(scene.shown)])
+    z = np.concatenate([t.shown[:, 2] for t in framed(scene.shown)])
     margin = 0.1 * (float(np.ptp(z)) + 0.1)
     ax.set_ylim(float(z.min()) - margin, float(z.max()) + margin)
     _label(ax, "height", "z (m)")
@@ -292,10 +294,9 @@ def _errors(ax: Axes, scene: _Scene) -> None:
     for run, track in scene.tracks.items():
         if run in scene.compared:
             found = scene.compared[run]
-            distance = np.linalg.norm(found.error, axis=1)
-            t, d = _thin(scene.seconds(found.t_ns), distance)
+            t, d = _thin(scene.seconds(found.t_ns), found.distance)
             ax.plot(t, d, color=track.color, linewidth=1.2)
-            top = max(top, float(distance.max())) if track in inside else top
+            top = max(top, found.worst_m) if track in inside else top
         topic = _topic(run, "sigma")
         if topic in scene.rec.channels:
             table = scene.rec.table(topic)

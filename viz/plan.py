@@ -27,32 +27,37 @@ def log_plan(stream: rr.RecordingStream, low: Floats, high: Floats) -> None:
 
     The camera looks straight down, x to the right and y up, as maps do.
     """
-    centre = (low + high) / 2
-    width = 1.25 * max(float((high - low)[:2].max()), 2.0)
-    above = np.array([centre[0], centre[1], low[2] + FAR * width])
-    down = np.diag([1.0, -1.0, -1.0])  # the camera's axes: right, down, forward
+    longest = max(float((high - low)[:2].max()), 2.0)
+    spacing = nice(longest / LINES)
+    margin = 0.05 * longest
+    xs, ys = (
+        np.arange(np.floor((a - margin) / spacing), np.ceil((b + margin) / spacing) + 1) * spacing + 0.0
+        for a, b in zip(low[:2], high[:2], strict=True)
+    )
+    width = max(float(np.ptp(xs)), float(np.ptp(ys))) + 3.0 * spacing  # and the names beside the lines
+    centre = ((xs[0] + xs[-1]) / 2, (ys[0] + ys[-1]) / 2)
+    z = float(low[2])
     stream.log(
         CAMERA,
-        rr.Transform3D(translation=above, mat3x3=down),
+        rr.Transform3D(translation=[*centre, z + FAR * width], mat3x3=np.diag([1.0, -1.0, -1.0])),
         rr.Pinhole(focal_length=FAR * PIXELS, width=PIXELS, height=PIXELS, image_plane_distance=0.0),
         static=True,
     )
-    spacing = nice(width / LINES)
-    xs, ys = (
-        np.arange(np.floor((c - width / 2) / spacing), np.ceil((c + width / 2) / spacing) + 1) * spacing + 0.0
-        for c in centre[:2]
-    )
-    z = float(low[2])
     lines = [[(x, ys[0], z), (x, ys[-1], z)] for x in xs] + [[(xs[0], y, z), (xs[-1], y, z)] for y in ys]
     stream.log(
         GRID, rr.LineStrips3D(lines, colors=(*GREY, 90), radii=rr.Radius.ui_points(0.5)), static=True
     )
-    beside = 0.3 * spacing  # a name at a line's end would lie on it
+    beside = 0.4 * spacing  # a name at a line's end would lie on it
     ticks = [(x, ys[0] - beside, z) for x in xs] + [(xs[0] - beside, y, z) for y in ys]
-    labels = [f"{v:g} m" for v in (*xs, *ys)]
     stream.log(
         TICKS,
-        rr.Points3D(ticks, labels=labels, colors=GREY, radii=rr.Radius.ui_points(0.0), show_labels=True),
+        rr.Points3D(
+            ticks,
+            labels=[f"{v:g} m" for v in (*xs, *ys)],
+            colors=GREY,
+            radii=rr.Radius.ui_points(0.0),
+            show_labels=True,
+        ),
         static=True,
     )
 

@@ -304,7 +304,7 @@ class Scene:
             found = compare(track, reference, self.alignment) if "/run/" in path else None
             if found is None:
                 continue
-            track.place, track.worst_m = found.place, float(np.linalg.norm(found.error, axis=1).max())
+            track.place, track.worst_m = found.place, found.worst_m
             self.static(
                 path, rr.Transform3D(translation=found.place.translation, mat3x3=found.place.rotation)
             )
@@ -313,7 +313,7 @@ class Scene:
             self.lines(error, names, style.AXES)
             self.lines(distance, [f"{track.owner} distance (m)"], [track.color])
             self.columns(error, found.t_ns, rr.Scalars.columns(scalars=found.error))
-            self.columns(distance, found.t_ns, rr.Scalars.columns(scalars=np.linalg.norm(found.error, axis=1)))
+            self.columns(distance, found.t_ns, rr.Scalars.columns(scalars=found.distance))
             self.show("error", track.owner, f"error after alignment {self.alignment} (m)", error)
             self.show("distance", track.owner, "distance to the reference (m)", distance)
 

@@ -16,8 +16,14 @@ Times = NDArray[np.int64]
 LIMIT = 65536
 """Points kept of a track; beyond it every second one goes, so memory stays bounded at any length."""
 
-RUN_AWAY = 3.0
+LARGER = 1.5
 """A track so many times larger than the smallest one has run away."""
+
+ASTRAY = 0.2
+"""And so has one that is farther from its reference than this share of its own size: filters drift a hundredth of it."""
+
+SPARSE_S = 0.3
+"""Points farther apart in time are places."""
 
 STANDING_M = 0.5
 """A track smaller than this has not walked."""
@@ -66,6 +72,11 @@ class Track:
         return self.place.points(self.positions)
 
     @property
+    def sparse(self) -> bool:
+        """Whether these are single places (surveyed footprints) rather than a motion."""
+        return self.count > 1 and float(np.median(np.diff(self.t_ns))) > SPARSE_S * 1e9
+
+    @property
     def size_m(self) -> float:
         """Diagonal of the box around all positions, m."""
         p = self.positions
@@ -99,7 +110,9 @@ def framed(tracks: Sequence[Track]) -> list[Track]:
     One that has run away (an uncorrected mechanization falls through the floor) must not hide the others.
     """
     walked = [t.size_m for t in tracks if t.size_m > STANDING_M]
-    return [t for t in tracks if t.size_m <= RUN_AWAY * min(walked)] if walked else list(tracks)
+    limit = LARGER * min(walked, default=np.inf)
+    near = [t for t in tracks if t.size_m <= limit and t.worst_m <= max(ASTRAY * t.size_m, STANDING_M)]
+    return near or list(tracks)
 
 
 @dataclass(frozen=True)
@@ -119,6 +132,16 @@ class Compared:
     place: Transform
     t_ns: Times
     error: Floats
+
+    @property
+    def distance(self) -> Floats:
+        """Distances (n,) to the reference, m."""
+        return np.sqrt(np.sum(self.error**2, axis=1))
+
+    @property
+    def worst_m(self) -> float:
+        """Largest distance."""
+        return float(self.distance.max())
 
 
 def compare(track: Track, reference: Track, alignment: str, max_gap_s: float = 0.1) -> Compared | None:
