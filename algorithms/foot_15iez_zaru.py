@@ -45,7 +45,7 @@ class Foot15IezZaruParams(base.Foot9IezParams, frozen=True, forbid_unknown_field
             "measured; the MPU-6050 wanders by about 1e-4 in a minute",
             ge=0.0,
         ),
-    ] = 3e-4
+    ] = 2e-4
     sigma_acc_bias0: Annotated[
         float, meta("Standard deviation of the accelerometer bias after the rest", "m/s²", "measured", ge=0.0)
     ] = 3e-4
@@ -151,7 +151,7 @@ class Foot15IezZaru(foot.FootEstimator):
 
     Departures: the source updates the bias in every stance; here the zero angular rate needs a rest of its
     own (``zaru_after_s``, ``zaru_gyr_max``), because a walking foot turns by 0.1–0.5 rad/s while it counts
-    as still. The prior of the gyroscope bias is what the rest leaves open (3e-4 rad/s); a loose one ruins
+    as still. The prior of the gyroscope bias is what the rest leaves open (2e-4 rad/s); a loose one ruins
     the walk.
     """
 
