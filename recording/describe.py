@@ -1,6 +1,6 @@
 """The table of columns in ``docs/recording-format.md``, from the schemas themselves.
 
-``python -m marcha.recording.describe docs/recording-format.md`` brings the page up to date; a test demands it.
+``python -m marcha.recording.describe docs/recording-format.md`` updates the page; a test demands it.
 """
 
 from __future__ import annotations

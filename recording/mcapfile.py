@@ -222,7 +222,13 @@ class McapFile:
         self._at += len(data)
 
 
-def pack(data: Bytes, channel_id: int, log: NDArray[np.int64], offsets: NDArray[np.int64]) -> Packed:
+def pack(
+    data: Bytes,
+    channel_id: int,
+    log: NDArray[np.int64],
+    offsets: NDArray[np.int64],
+    level: int = ZSTD_LEVEL,
+) -> Packed:
     """Compress message records of one channel into a chunk and build its message index.
 
     Parameters
@@ -233,9 +239,11 @@ def pack(data: Bytes, channel_id: int, log: NDArray[np.int64], offsets: NDArray[
         Their channel.
     log, offsets : ndarray of int64, shape (n,)
         Log time and first byte of every record.
+    level : int
+        Compression level of zstd.
     """
     raw = data.data
-    compressed = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress(raw)
+    compressed = zstandard.ZstdCompressor(level=level).compress(raw)
     first, last = int(log.min()), int(log.max())
     chunk = RecordBuilder()
     Chunk("zstd", compressed, last, first, zlib.crc32(raw), data.size).write(chunk)

@@ -18,7 +18,7 @@ from .annotations import EVENT, TOPIC, check_annotations, encode_events
 from .codec import Encoder, check_times
 from .definitions import full_text
 from .errors import MarchaError, UsageError
-from .mcapfile import CHUNK_SIZE, McapFile, Packed, pack
+from .mcapfile import CHUNK_SIZE, ZSTD_LEVEL, McapFile, Packed, pack
 from .schemas import find_schema
 
 if TYPE_CHECKING:
@@ -65,8 +65,9 @@ class Writer:
     :func:`marcha.recording.create`.
     """
 
-    def __init__(self, path: Path | str, *, overwrite: bool = False) -> None:
+    def __init__(self, path: Path | str, *, overwrite: bool = False, level: int = ZSTD_LEVEL) -> None:
         self.path = Path(path)
+        self._level = level
         self._file = McapFile(self.path, overwrite=overwrite)
         self._outputs: dict[str, _Output] = {}
         self._annotations: list[pl.DataFrame] = []
@@ -334,7 +335,7 @@ class Writer:
             self._submit(out, encoder, block)
 
     def _submit(self, out: _Output, encoder: Encoder, block: dict[str, NDArray[Any]]) -> None:
-        self._file.submit(_lay, encoder, block, out.sequence)
+        self._file.submit(_lay, encoder, block, out.sequence, self._level)
         out.sequence += len(block["t_ns"])
 
     def _put_annotations(self, table: pl.DataFrame) -> None:
@@ -360,10 +361,10 @@ class Writer:
                 self._file.submit(pack_records, batch, id_)
 
 
-def _lay(encoder: Encoder, block: dict[str, NDArray[Any]], sequence: int) -> Packed:
+def _lay(encoder: Encoder, block: dict[str, NDArray[Any]], sequence: int, level: int) -> Packed:
     """Lay one block of rows into a chunk; runs in a worker thread."""
     data, offsets = encoder.encode(block, block["t_ns"], block["t_log_ns"], sequence)
-    return pack(data, encoder.channel_id, block["t_log_ns"], offsets)
+    return pack(data, encoder.channel_id, block["t_log_ns"], offsets, level)
 
 
 def pack_records(records: Sequence[tuple[int, bytes]], channel_id: int) -> Packed:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 
-import pytest
-
 import marcha.recording as mr
+import pytest
 from marcha.recording.describe import updated
 
 from .conftest import ROOT
@@ -29,7 +28,7 @@ def test_every_type_and_column_is_described(schema):
 
 def test_every_finding_kind_is_listed():
     source = "".join(p.read_text(encoding="utf-8") for p in (ROOT / "recording").glob("*.py"))
-    kinds = set(re.findall(r"(?:_add|add_finding)\([^\"]*?\"([a-z_]+)\"", source))
+    kinds = set(re.findall(r"\b_?add(?:_finding)?\(\s*(?:\w+\.)*(?:findings|found),\s*\"([a-z_]+)\"", source))
     kinds |= set(re.findall(r"(?:Finding|said)\(\s*\"([a-z_]+)\"", source))
     assert len(kinds) > 12
     assert {k for k in kinds if f"`{k}`" not in PAGE} == set()
