@@ -8,14 +8,18 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from .console import Heading, Outcome, Table
-from .options import DEFAULT, Common, Force, MaybeOutput, Shown, Strings, instant, settings
+from .options import DEFAULT, QUIET, Common, Force, MaybeOutput, Shown, Strings, instant, settings
 
 if TYPE_CHECKING:
     import polars as pl
 
     from ..recording import Recording
 
-app = App(name="annotate", help="Add, import or list labelled intervals of a recording.")
+app = App(
+    name="annotate",
+    help="Add, import or list labelled intervals of a recording.",
+    default_parameter=QUIET,
+)
 
 InPlace = Annotated[bool, Parameter(name="--in-place", negative="")]
 

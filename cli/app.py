@@ -11,10 +11,11 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from cyclopts import App, CycloptsError, Group, Parameter
+from cyclopts import App, CycloptsError, Group
 
 from .console import Outcome, complain, emit, emit_json, warn
 from .errors import DONE, FAILED, INTERRUPTED, USAGE, expected
+from .options import QUIET
 
 EPILOGUE = (
     "Exit codes: 0 done; 1 failed; 2 wrong usage; 3 done, but data was lost or\n"
@@ -61,7 +62,7 @@ def build(*, overview: bool = False) -> App:
         help="From raw logs of walking to one recording, replayed and looked at.",
         help_epilogue=EPILOGUE,
         version=_version,
-        default_parameter=Parameter(negative="", show_default=False),
+        default_parameter=QUIET,
         help_format="plaintext",
         help_formatter="plain" if overview else "default",  # plain is there in half the time
         result_action="return_value",

@@ -30,6 +30,9 @@ DEFAULT = Common()
 Force = Annotated[bool, Parameter(name="--force", negative="")]
 Output = Annotated[Path, Parameter(name=("--output", "-o"))]
 MaybeOutput = Annotated[Path | None, Parameter(name=("--output", "-o"))]
+QUIET = Parameter(negative="", show_default=False)
+"""What holds for every parameter: no ``--no-…`` twin, and a default is said only where :data:`Shown`."""
+
 Shown = Parameter(show_default=True)
 """Marks a default that help should state; the others go without saying."""
 Strings = Annotated[tuple[str, ...], Parameter(negative="", consume_multiple=False)]

@@ -1,4 +1,4 @@
-"""The page ``docs/cli.md``, written from the commands themselves: ``python -m marcha.cli.reference > docs/cli.md``."""
+"""The page ``docs/cli.md``, written from the commands: ``python -m marcha.cli.reference > docs/cli.md``."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ HEAD = """# The command line
 This page is written by `python -m marcha.cli.reference`; a test keeps it true.
 
 `--json` on every command prints exactly one JSON object on standard output (also when it fails:
-`{"error": …, "exit_code": …}`); messages and progress go to standard error. Colour and progress bars appear only on a
-terminal, and `NO_COLOR` is respected. An expected failure is one line, `marcha: FILE: what is wrong; what to do`; a
-traceback is a bug: please report it.
+`{"error": …, "exit_code": …}`); messages and progress go to standard error. Colour and progress bars appear
+only on a terminal, and `NO_COLOR` is respected. An expected failure is one line,
+`marcha: FILE: what is wrong; what to do`; a traceback is a bug: please report it.
 
-Moments (`--from`, `--to`, `--start`, `--end`) are `12.5`, `12.5s`, `1m`, `500ms` or `250000ns` after the recording's start, or
-`@1700000000000000000`, nanoseconds of its own clock. Ranges are half open.
+Moments (`--from`, `--to`, `--start`, `--end`) are `12.5`, `12.5s`, `1m`, `500ms` or `250000ns` after the
+recording's start, or `@1700000000000000000`, nanoseconds of its own clock. Ranges are half open.
 
-Outputs appear whole or not at all and are never replaced without `--force`. A process that is killed leaves at most one
-hidden `.NAME.PID.part` beside the output; the next run that writes the same output removes it.
+Outputs appear whole or not at all and are never replaced without `--force`. A process that is killed leaves
+at most one hidden `.NAME.PID.part` beside the output; the next run that writes the same output removes it.
 """
 
 

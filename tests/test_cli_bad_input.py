@@ -193,7 +193,7 @@ def test_mixed_line_ends_change_nothing(tmp_path: Path) -> None:
 def test_any_damage_gives_a_report_or_one_line(
     tmp_path_factory: pytest.TempPathFactory, at: int, cut: int, junk: bytes, tail: int
 ) -> None:
-    """Bytes cut out, thrown in and lost at the end: rows are kept or dropped, and every one is accounted for."""
+    """Bytes cut out, thrown in, lost at the end: every row is kept or dropped, and counted."""
     folder = tmp_path_factory.mktemp("damaged")
     data = text(rows(150))
     damaged = data[:at] + junk + data[at + cut :]

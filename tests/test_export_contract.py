@@ -5,9 +5,8 @@ from __future__ import annotations
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
-import pytest
-
 import marcha.recording as mr
+import pytest
 from marcha.export import available, export, registry
 from marcha.recording import UsageError
 

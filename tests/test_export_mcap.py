@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import marcha.recording as mr
 import polars as pl
 import pytest
-from polars.testing import assert_frame_equal
-
-import marcha.recording as mr
 from marcha.export import export
 from marcha.recording import Recording
+from polars.testing import assert_frame_equal
 
 from .contracts.exporter import START_NS, example
 

@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import marcha.recording as mr
 import polars as pl
 import pytest
-from polars.testing import assert_frame_equal
-
-import marcha.recording as mr
 from marcha.export import export
 from marcha.export.tables import _file_names
 from marcha.recording import MarchaError, Recording
+from polars.testing import assert_frame_equal
 
 from .contracts.exporter import ROWS, START_NS, example
 from .recording_samples import sample_table, write

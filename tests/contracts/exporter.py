@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar
 
+import marcha.recording as mr
 import msgspec
 import numpy as np
 import polars as pl
 import pytest
-
-import marcha.recording as mr
 from marcha.export import available, export
 from marcha.recording import OutputExists, Recording, UsageError
 
@@ -21,8 +20,8 @@ ROWS = 3000
 def example(path: Path) -> Path:
     """Write a small recording with all that an exporter must cope with; return its path.
 
-    Two sensors at different rates, an estimate that was known later than it speaks of, a channel without a message,
-    annotations, metadata and an attachment.
+    Two sensors at different rates, an estimate that was known later than it speaks of, a channel without a
+    message, annotations, metadata and an attachment.
     """
     t_ns = START_NS + 10_000_000 * np.arange(ROWS, dtype=np.int64)
     wave = np.sin(np.arange(ROWS) / 7.0)
@@ -54,8 +53,8 @@ def example(path: Path) -> Path:
 class ExporterContract:
     """Subclass as ``class TestMine(ExporterContract)`` and set ``name``.
 
-    What it promises: it is registered and describes itself; the output appears whole or not at all; nothing is
-    overwritten unless asked; the recording is left as it was; options are checked.
+    What it promises: it is registered and describes itself; the output appears whole or not at all; nothing
+    is overwritten unless asked; the recording is left as it was; options are checked.
     """
 
     name: ClassVar[str] = ""
