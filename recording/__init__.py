@@ -60,8 +60,8 @@ def create(path: Path | str, *, overwrite: bool = False, level: int = ZSTD_LEVEL
     overwrite : bool
         Whether it may be replaced.
     level : int
-        Compression level of zstd. The default suits raw readings; level 1 takes less than half the time and gives
-        the same size for computed numbers, whose low bits are noise.
+        Compression level of zstd. The default suits raw readings; level 1 takes less than half the time and
+        gives the same size for computed numbers, whose low bits are noise.
 
     Raises
     ------
