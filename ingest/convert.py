@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,6 +14,7 @@ import polars as pl
 
 from .. import recording as mr
 from ..recording.errors import MarchaError, OutputExists, UsageError
+from ..recording.provenance import provenance
 from . import registry
 from .contract import ChannelSpec, CommonOptions, Import, Report, SourceAttachment
 from .truth import Truth, as_text, read_truth
@@ -96,17 +95,17 @@ def convert(
         registered, files = registry.choose(sources, format, stack)
         settings = registry.make_options(registered.importer, chosen)
         truth = read_truth(files[0])
-        hashes = stack.enter_context(ThreadPoolExecutor(1)).submit(_sources, files, truth)
+        facts = {
+            "importer": registered.importer.name,
+            "importer_version": registered.source,
+            "options": chosen,
+            "given": ", ".join(p.name for p in sources),
+        }
+        hashed = [p for _, p in _files([*files, *(truth.files if truth else ())])]
+        origin = stack.enter_context(ThreadPoolExecutor(1)).submit(provenance, hashed, **facts)
         imported = registered.importer.read(files, settings)
         if strict:
             imported.refuse_changes(files[0])
-        provenance = {
-            "importer": registered.importer.name,
-            "importer_version": registered.source,
-            "options": msgspec.json.encode(chosen, order="sorted").decode(),
-            "tool": f"marcha {version('marcha')}",
-            "given": ", ".join(p.name for p in sources),
-        }
         try:
             with mr.create(out, overwrite=overwrite) as recording:
                 written = _Writer(recording, settings, progress)
@@ -118,8 +117,8 @@ def convert(
                 for spec, table in truth.tables if truth else ():
                     written.declare(spec)
                     written.add(spec.topic, table)
-                provenance["sources"] = msgspec.json.encode(hashes.result()).decode()
-                for name, record in _metadata(imported, settings, truth, provenance, report).items():
+                records = _metadata(imported, settings, truth, report) | {"provenance": origin.result()}
+                for name, record in records.items():
                     recording.add_metadata(name, record)
                 for item in [*imported.attachments, *(_raw(files) if settings.keep_source else ())]:
                     recording.add_attachment(item.name, item.data, item.media_type)
@@ -209,7 +208,6 @@ def _metadata(
     imported: Import,
     options: CommonOptions,
     truth: Truth | None,
-    provenance: dict[str, str],
     report: Report,
 ) -> dict[str, dict[str, str]]:
     records = {name: dict(record) for name, record in imported.metadata.items()}
@@ -221,7 +219,6 @@ def _metadata(
             known[key] = as_text(value)
     if known:
         records["truth"] = records.get("truth", {}) | known
-    records["provenance"] = provenance
     records["import_report"] = {
         **{k: str(getattr(report, k)) for k in ("rows_read", "rows_kept", "rows_repaired", "rows_dropped")},
         "lossy": as_text(report.lossy),
@@ -236,16 +233,6 @@ def _files(paths: Sequence[Path]) -> Iterator[tuple[str, Path]]:
             yield from ((p.relative_to(path).as_posix(), p) for p in sorted(path.rglob("*")) if p.is_file())
         else:
             yield path.name, path
-
-
-def _sources(paths: Sequence[Path], truth: Truth | None) -> list[dict[str, str | int]]:
-    """Return name, size and BLAKE2b hash of every source file."""
-    found = []
-    for name, path in _files([*paths, *(truth.files if truth else ())]):
-        with path.open("rb") as f:
-            digest = hashlib.file_digest(f, "blake2b").hexdigest()
-        found.append({"name": name, "size": path.stat().st_size, "blake2b": digest})
-    return found
 
 
 def _raw(paths: Sequence[Path]) -> Iterator[SourceAttachment]:
