@@ -104,8 +104,11 @@ def float_blocks(path: Path, header: Header, required: str, report: ReportBuilde
         )
         columns = {"line": block["line"]}
         for place, name in names.items():
+            value = _numbers(block[place])
+            columns[name] = value.fill_null(math.nan)
+            if not value.null_count():
+                continue
             text = block[place].str.strip_chars()
-            value = _numbers(text)
             given = text.is_not_null() & ~text.str.to_lowercase().is_in(MISSING)
             odd = given & value.is_null()
             if odd.any():
@@ -117,19 +120,21 @@ def float_blocks(path: Path, header: Header, required: str, report: ReportBuilde
                     line=block["line"][at],
                     subject=f"{name} unreadable",
                 )
-            columns[name] = value.fill_null(math.nan)
         yield pl.DataFrame(columns)
 
 
 def _numbers(text: pl.Series) -> pl.Series:
     """Return finite numbers, null for anything else."""
     value = text.cast(pl.Float64, strict=False)
-    return pl.select(pl.when(value.is_finite()).then(value)).to_series()
+    if value.null_count():
+        value = text.str.strip_chars().cast(pl.Float64, strict=False)
+    finite = value.is_finite()
+    return value if finite.all(ignore_nulls=False) else pl.select(pl.when(finite).then(value)).to_series()
 
 
 def _with_number(block: pl.DataFrame, place: str, name: str, report: ReportBuilder) -> pl.DataFrame:
     """Return the rows with a number in column ``place``; the others are bad rows."""
-    bad = _numbers(block[place].str.strip_chars()).is_null()
+    bad = _numbers(block[place]).is_null()
     if not bad.any():
         return block
     at = int(bad.arg_true()[0])
