@@ -82,11 +82,11 @@ def _clean_row(data, pos, n, low, high, values, row):
             i += 1
         start = i
         value = np.int64(0)
-        digit = data[i] - np.uint8(48)
-        while digit < 10 and i - start < 17:
+        digit = np.int64(data[i]) - 48
+        while 0 <= digit <= 9 and i - start < 17:
             value = value * 10 + digit
             i += 1
-            digit = data[i] - np.uint8(48)
+            digit = np.int64(data[i]) - 48
         if negative:
             value = -value
         if i == start or value < low[column] or value > high[column]:
