@@ -379,7 +379,37 @@ def test_annotate_needs_one_place_to_write_to(folder: Path, tmp_path: Path) -> N
     assert marcha(*what, "-o", tmp_path / "a.mcap", "--in-place").code == 2
 
 
-def test_study_runs_a_small_configuration(folder: Path, tmp_path: Path) -> None:
+STUDY = """
+title = "one filter"
+[recordings]
+files = ["conf-*.csv"]
+[[estimators]]
+name = "foot.naive"
+[[metrics]]
+column = "path_m"
+"""
+
+
+def test_study_of_raw_logs(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text(STUDY)
+    arguments = (
+        "study",
+        tmp_path / "study.toml",
+        "--data",
+        folder / "raw",
+        "-o",
+        tmp_path / "out",
+        "--workers",
+        "1",
+    )
+    done = marcha(*arguments, "--json")
+    assert done.code == 0, done.err
+    assert {"output", "cells", "files"} <= done.document.keys()
+    assert pl.read_parquet(tmp_path / "out" / "results.parquet").height == done.document["cells"] == 2
+    assert (tmp_path / "out" / "report.html").is_file()
+
+
+def test_study_with_an_unknown_preset(tmp_path: Path) -> None:
     done = marcha("study", "no-such-preset", "-o", tmp_path / "s", "--json")
     assert done.code == 2
     assert "no-such-preset" in done.document["error"]
