@@ -528,23 +528,24 @@ class Recording:
         return None
 
     def _spans(self) -> dict[int, tuple[int, int, int]]:
-        """Return count, first and last log time of every channel id."""
-        spans: dict[int, tuple[int, int, int]] = {}
-
-        def add(id_: int, count: int, first: int, last: int) -> None:
-            old = spans.get(id_)
-            spans[id_] = (
-                (count, first, last)
-                if old is None
-                else (old[0] + count, min(old[1], first), max(old[2], last))
-            )
-
+        """Return count, first and last log time of every channel id that has messages."""
+        counts: dict[int, int] = {}
+        times: dict[int, tuple[int, int]] = {}
+        statistics = self.contents.statistics
+        stated = statistics.channel_message_counts if statistics is not None else {}
         for ref in self.contents.chunks:
-            times = self._times(ref)
-            for id_, log in times.items():
-                if len(log):
-                    add(id_, len(log), int(log.min()), int(log.max()))
-        return spans
+            if len(ref.indexes) == 1 and ref.indexes.keys() <= stated.keys():
+                spans = dict.fromkeys(ref.indexes, (ref.first_ns, ref.last_ns))
+            else:
+                logs = {k: log for k, log in self._times(ref).items() if len(log)}
+                spans = {k: (int(log.min()), int(log.max())) for k, log in logs.items()}
+                for k, log in logs.items():
+                    counts[k] = counts.get(k, 0) + len(log)
+            for id_, (first, last) in spans.items():
+                old = times.get(id_, (first, last))
+                times[id_] = min(old[0], first), max(old[1], last)
+        counts |= stated
+        return {i: (counts.get(i, 0), *span) for i, span in times.items()}
 
     def _times(self, ref: ChunkRef) -> dict[int, Any]:
         if ref.index_length and not ref.loose:
