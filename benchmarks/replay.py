@@ -121,12 +121,14 @@ def _vqf(readings: np.ndarray) -> None:
 
 
 def _peak_mb(path: Path) -> float:
-    """Return the peak memory of a process that replays a recording into another one."""
+    """Return the peak memory of a process that replays a recording into another one (Linux; else NaN)."""
     code = (
-        "import resource, sys, marcha.recording as mr; from marcha.replay import replay\n"
+        "import pathlib, re, sys, marcha.recording as mr; from marcha.replay import replay\n"
         "replay(mr.open(sys.argv[1]), ['foot.9iez'], out=sys.argv[1] + '.out', overwrite=True,"
         " keep_tables=False, metrics=False)\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)\n"
+        "status = pathlib.Path('/proc/self/status')\n"  # ru_maxrss would count the parent's memory too
+        "text = status.read_text() if status.exists() else ''\n"
+        "print(next(iter(re.findall(r'VmHWM:\\s+(\\d+)', text)), 'nan'))\n"
     )
     done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
-    return float(done.stdout)
+    return float(done.stdout) / 1024
