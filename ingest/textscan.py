@@ -66,6 +66,30 @@ def _wall_clock(data, a, b):
 
 
 @numba.njit(cache=True, nogil=True)
+def _words(data, a, b):
+    """Whether a line is text (a boot message, a header): begins like it and has no cell that is a number."""
+    c = data[a]
+    if not ((65 <= c <= 90) or (97 <= c <= 122) or c == 35 or c == 42 or c == 61 or c == 91):  # # * = [
+        return False
+    digits = 0
+    other = 0
+    for k in range(a, b + 1):
+        c = data[k] if k < b else np.uint8(44)
+        if c == 44 or c == 59 or c == 9:
+            if digits > 0 and other == 0:
+                return False
+            digits = 0
+            other = 0
+        elif _digit(c):
+            digits += 1
+        elif c < 32:
+            return False
+        elif c != 32 and c != 43 and c != 45:
+            other += 1
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
 def _clean_row(data, pos, n, low, high, values, row):
     """Read a row of the plainest form, or a blank line; return where the next begins, -1 if it is neither."""
     columns = low.size
@@ -211,16 +235,7 @@ def scan(data, low, high, first_line, values, lines, wall, odd):
                 while i < b and _space(data[i]):
                     i += 1
         if status == NOT_A_NUMBER and column == 0:
-            # Words (boot messages) are no damaged row; what begins with a sign or a separator is one.
-            c = data[a]
-            words = (65 <= c <= 90) or (97 <= c <= 122) or c == 35 or c == 91 or c == 42 or c == 61
-            separators = 0
-            for k in range(a, b):
-                if data[k] == 44 or data[k] == 59 or data[k] == 9:
-                    separators += 1
-                if data[k] < 32 and data[k] != 9:
-                    words = False
-            if words and separators < 2:
+            if _words(data, a, b):
                 status = CHATTER
         elif status == ROW and column < columns:
             status = FEW

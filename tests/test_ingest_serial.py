@@ -88,6 +88,8 @@ def test_separators_and_line_ends(tmp_path: Path, separator: bytes, end: bytes) 
         (b"1200,1,2,3,4,99999999999999999999,6,7,8,9,10,11,12", "column 6 .gy1. is outside"),
         (b"-1200,1,2,3,4,5,6,7,8,9,10,11,12", "column 1 .t_ms. is outside"),
         (b"\x00\xff\x80,,", "column 1 .t_ms. is not"),
+        (b"garbage,1,2", "column 1 .t_ms. is not"),
+        (b"x200,1,2,3,4,5,6,7,8,9,10,11,12", "column 1 .t_ms. is not"),
     ],
 )
 def test_bad_row_says_line_and_reason(tmp_path: Path, damaged: bytes, why: str) -> None:
@@ -104,9 +106,10 @@ def test_bad_row_says_line_and_reason(tmp_path: Path, damaged: bytes, why: str) 
 
 
 def test_boot_chatter_is_named_not_counted(tmp_path: Path) -> None:
-    text = b"Configuring MPU-01...\r\nOK\r\n" + b"\n".join(line(i) for i in range(60)) + b"\n"
+    chatter = b"Configuring MPU-01...\r\nt_ms,ax1,ay1,az1\r\n# full scale 16 g\r\nreset, code 7\r\n"
+    text = chatter + b"\n".join(line(i) for i in range(60)) + b"\n"
     _, report, _ = read(write(tmp_path, text))
-    assert kinds(report) == {"chatter": 2}
+    assert kinds(report) == {"chatter": 4}
     assert report.rows_read == 60
     assert not report.lossy
 
