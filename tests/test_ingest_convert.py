@@ -94,6 +94,24 @@ def test_truth_beside_the_log_becomes_reference(walk: Path, tmp_path: Path) -> N
     assert float(rec.metadata["truth"]["length_m"]) == pytest.approx(22.1)
 
 
+def test_everything_that_a_capture_suffers(tmp_path: Path) -> None:
+    """Roll-over, chatter, wall clock, cut ends, dropped and doubled rows: named, and truth still in step."""
+    options = {"boot_chatter": True, "cut_first": True, "cut_last": True, "wall_clock": True}
+    damage = {"drop_share": 0.01, "duplicate_share": 0.01, "start_ms": 2**32 - 9000}
+    log = simulate("rectangle", tmp_path / "raw", seed=4, **options, **damage).paths[0]
+    done = convert(log, tmp_path / "walk.mcap")
+    found = {f.kind for f in done.report.findings}
+    assert {"counter_rollover", "chatter", "bad_row", "duplicate_row", "gap"} <= found
+    assert done.report.lossy
+    rec = mr.open(tmp_path / "walk.mcap")
+    truth = set(rec.table("/reference/pose")["t_ns"].to_list())
+    imu = rec.table("/foot/imu1")["t_ns"]
+    assert set(imu.to_list()) <= truth
+    assert imu.is_sorted()
+    assert len(imu) > 0.95 * len(truth)
+    assert "wall_clock_first" in rec.metadata["device"]
+
+
 def test_truth_by_option(walk: Path, tmp_path: Path) -> None:
     for side in walk.parent.glob("*.truth.*"):
         side.unlink()
