@@ -87,7 +87,7 @@ class SensorConnectCsv:
 
     name: ClassVar[str] = "sensorconnect-csv"
     title: ClassVar[str] = "CSV of MicroStrain SensorConnect, with measured footprints"
-    Options: ClassVar[type[CommonOptions]] = SensorConnectOptions
+    Options = SensorConnectOptions
     joins: ClassVar[bool] = True
 
     def sniff(self, head: bytes, path: Path) -> float:

@@ -53,7 +53,7 @@ class ViconMat:
 
     name: ClassVar[str] = "vicon-mat"
     title: ClassVar[str] = "MATLAB file of a foot-mounted walk with Vicon positions (imu, gt, ts)"
-    Options: ClassVar[type[CommonOptions]] = ViconOptions
+    Options = ViconOptions
 
     def sniff(self, head: bytes, path: Path) -> float:
         """A MATLAB file that holds ``imu``, ``gt`` and ``ts``."""

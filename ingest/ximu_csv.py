@@ -56,7 +56,7 @@ class XimuCsv:
 
     name: ClassVar[str] = "ximu-csv"
     title: ClassVar[str] = "calibrated CSV of the x-IMU: a packet counter, no time"
-    Options: ClassVar[type[CommonOptions]] = XimuOptions
+    Options = XimuOptions
 
     def sniff(self, head: bytes, path: Path) -> float:
         """A header with the packet counter and x-io's column names."""

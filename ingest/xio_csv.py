@@ -42,7 +42,7 @@ class XioCsv:
 
     name: ClassVar[str] = "xio-csv"
     title: ClassVar[str] = "x-io CSV with a time column and units in its header (x-IMU3)"
-    Options: ClassVar[type[CommonOptions]] = XioOptions
+    Options = XioOptions
 
     def sniff(self, head: bytes, path: Path) -> float:
         """A header with x-io's column names and a time."""
