@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -538,7 +538,8 @@ class Plan:
             if schema.names:
                 count = layout.sequences[schema.names]
                 constants += [f"{schema.names}[{i}]" for i in range(count)]
-                names = tuple(layout.text(record, f"{schema.names}[{i}]") or "" for i in range(count))
+                given = (layout.text(record, f"{schema.names}[{i}]") or "" for i in range(count))
+                names = _distinct(["t_ns", "t_log_ns", *given])[2:]
             self.rows.append(_bind(schema, layout, record, names, decoder.columns))
             self.stamps.append(schema.stamp)
         fields = layout.dtype.fields or {}
@@ -631,7 +632,19 @@ def _flatten(layout: Layout, decoder: Decoder) -> list[Binding]:
             bindings += [Binding(f"{path}[{i}]", "number", f"{path}[{i}]") for i in range(format_.shape[0])]
         else:
             bindings.append(Binding(path, "number", path))
-    return [b for b in bindings if b.path != "header.frame_id"]
+    bindings = [b for b in bindings if b.path != "header.frame_id"]
+    columns = _distinct(["t_ns", "t_log_ns", *(b.column for b in bindings)])[2:]
+    return [b._replace(column=c) for b, c in zip(bindings, columns, strict=True)]
+
+
+def _distinct(names: Iterable[str]) -> tuple[str, ...]:
+    """Return the names with a number behind those that are taken: no column may hide another."""
+    seen: dict[str, int] = {}
+    out: list[str] = []
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        out.append(name if seen[name] == 1 else f"{name}#{seen[name]}")
+    return tuple(out)
 
 
 def _view(messages: Messages, dtype: np.dtype[Any]) -> NDArray[Any]:

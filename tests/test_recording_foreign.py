@@ -236,6 +236,31 @@ def test_messages_that_do_not_fit_their_type_become_a_finding(tmp_path):
     assert [f.kind for f in rec.findings] == ["unreadable_channel"]
 
 
+def test_equal_names_do_not_hide_each_other(tmp_path):
+    library = load("sensor_msgs/msg/JointState")
+    value = {
+        "header": {"stamp": {"sec": 0, "nanosec": 1}, "frame_id": ""},
+        "name": ["knee", "knee", "t_ns"],
+        "position": [1.0, 2.0, 3.0],
+        "velocity": [],
+        "effort": [],
+    }
+    data = encode(value, library["sensor_msgs/JointState"], library)
+    table = mr.open(
+        raw_writer(tmp_path / "a.mcap", [("/j", 1, data)], ("/j",), "sensor_msgs/msg/JointState")
+    ).table("/j")
+    assert table.to_dicts() == [{"t_ns": 1, "knee": 1.0, "knee#2": 2.0, "t_ns#2": 3.0}]
+
+
+def test_a_field_called_t_ns_does_not_hide_the_time(tmp_path):
+    library = parse_full("pkg/msg/Clock", "int64 t_ns\n")
+    data = encode({"t_ns": 5}, library["pkg/Clock"], library)
+    table = mr.open(
+        raw_writer(tmp_path / "a.mcap", [("/c", 7, data)], ("/c",), "pkg/msg/Clock", "int64 t_ns\n")
+    ).table("/c")
+    assert table.to_dicts() == [{"t_ns": 7, "t_ns#2": 5}]
+
+
 def test_joint_names_that_change_are_kept_apart(tmp_path):
     library = load("sensor_msgs/msg/JointState")
     rows = []
