@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import polars as pl
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -153,44 +154,44 @@ def box_by_both(frame: pl.DataFrame, config: cfg.StudyConfig, log: bool = False)
 
 
 def qq(frame: pl.DataFrame, config: cfg.StudyConfig) -> Figure | None:
-    """Normal Q-Q plots of one metric, a panel a configuration × filter; None where all are too small."""
+    """Normal Q-Q plot of one metric, a panel a configuration; None where every group is too small.
+
+    Values are standardized with their group's mean and standard deviation, so that all filters fit one panel.
+    """
     from scipy import stats
 
     levels = order(frame, config)
-    filters, configurations = levels["filter"], levels["configuration"]
-    least = config.statistics.min_samples
+    filters = levels["filter"]
     good = frame.filter(~pl.col("outlier") & pl.col("value").is_finite())
-    groups = {
-        key: part["value"].to_numpy()
-        for key, part in good.group_by("configuration", "filter")
-        if len(part) >= least
-    }
-    rows = [c for c in configurations if any((c, f) in groups for f in filters)]
-    columns = [f for f in filters if any((c, f) in groups for c in rows)]
-    if not rows:
+    groups: dict[str, dict[str, np.ndarray]] = {}
+    for configuration in levels["configuration"]:
+        samples = _samples(good.filter(configuration=configuration), "filter", filters)
+        fitting = {
+            f: v for f, v in samples.items() if len(v) >= config.statistics.min_samples and np.ptp(v) > 0
+        }
+        if fitting:
+            groups[configuration] = fitting
+    if not groups:
         return None
-    figure = Figure(figsize=(0.8 + 2.3 * len(columns), 0.9 + 2.1 * len(rows)))
-    axes = figure.subplots(len(rows), len(columns), squeeze=False)
-    for i, configuration in enumerate(rows):
-        for k, name in enumerate(columns):
-            ax = axes[i, k]
-            values = groups.get((configuration, name))
-            if i == 0:
-                ax.set_title(name)
-            if k == 0:
-                ax.set_ylabel(configuration)
-            if values is None:
-                ax.text(0.5, 0.5, "too few values", transform=ax.transAxes, ha="center", color=GREY)
-                ax.set(xticks=[], yticks=[])
-                continue
-            fit: Any = stats.probplot(values)
-            (quantiles, ordered), (slope, intercept, _) = fit
-            ax.plot(quantiles, ordered, ".", color=colour(filters.index(name)), markersize=5)
-            ends = np.array([quantiles[0], quantiles[-1]])
-            ax.plot(ends, intercept + slope * ends, color="black", linewidth=0.9)
-            ax.tick_params(labelsize=8)
+    columns = min(4, len(groups))
+    rows = -(-len(groups) // columns)
+    figure = Figure(figsize=(max(5.0, 0.8 + 2.9 * columns), 1.1 + 2.7 * rows))
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    for ax, (configuration, samples) in zip(axes, groups.items(), strict=False):
+        reach = 2.0
+        for name, values in samples.items():
+            fit: Any = stats.probplot((values - values.mean()) / values.std(ddof=1), fit=False)
+            ax.plot(*fit, ".", color=colour(filters.index(name)), markersize=5)
+            reach = max(reach, float(fit[0][-1]))
+        ax.plot([-reach, reach], [-reach, reach], color="black", linewidth=0.9)
+        ax.set_title(configuration)
+    for ax in axes[len(groups) :]:
+        ax.set_visible(False)
     figure.supxlabel("quantiles of the standard normal distribution")
-    figure.supylabel(_axis_label(frame) + ", by configuration")
+    figure.supylabel("standardized values")
+    drawn = [k for k, f in enumerate(filters) if any(f in samples for samples in groups.values())]
+    handles = [Line2D([], [], marker="o", linestyle="", color=colour(k), label=filters[k]) for k in drawn]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False)
     figure.suptitle(f"Q-Q plots of {frame['metric'][0]}")
     return figure
 
@@ -234,12 +235,13 @@ def tracks(cells: Sequence[Cell], config: cfg.StudyConfig) -> Figure | None:
 def _overlay(ax: Axes, cells: Sequence[Cell], face: str, middle: np.ndarray, reach: float) -> None:
     """Draw one panel of tracks."""
     alpha = min(1.0, max(0.15, 4 / max(1, len(cells))))
-    outside = 0
-    for cell in cells:
-        x, y, _ = cell.positions.T
-        ax.plot(x, y, color=face, linewidth=0.9, alpha=alpha, linestyle="--" if cell.clipped else "-")
-        ax.plot(x[-1], y[-1], "o", color="black", markersize=2.5, alpha=max(alpha, 0.4))
-        outside += bool((np.abs(cell.positions[:, :2] - middle) > reach).any())
+    paths = [cell.positions[:, :2] for cell in cells]
+    outside = sum(bool((np.abs(path - middle) > reach).any()) for path in paths)
+    if paths:
+        styles = ["--" if cell.clipped else "-" for cell in cells]
+        ax.add_collection(LineCollection(paths, colors=face, linewidths=0.9, alpha=alpha, linestyles=styles))
+        ends = np.array([path[-1] for path in paths])
+        ax.plot(*ends.T, "o", color="black", markersize=2.5, alpha=max(alpha, 0.4))
     ax.plot(0, 0, "+", color="black", markersize=8)
     ax.set_aspect("equal", adjustable="box")
     note = f"n = {len(cells)}" + (f", {outside} leave the frame" if outside else "")
