@@ -48,14 +48,11 @@ def rows(scale: float = 1.0) -> list[Row]:
 def _table(n: int) -> pl.DataFrame:
     rng = np.random.default_rng(0)
     names = [f"{s}_{a}" for s in ("acc", "gyr") for a in "xyz"]
-    return pl.DataFrame(
-        {"t_ns": np.arange(n) * 10_000_000, **{name: rng.normal(size=n) for name in names}}
-    )
+    return pl.DataFrame({"t_ns": np.arange(n) * 10_000_000, **{name: rng.normal(size=n) for name in names}})
 
 
 def _columns(n: int) -> tuple[float, float]:
     import rerun as rr
-
     from marcha.replay import PlannedChannel
     from marcha.viz.draw import new_stream
     from marcha.viz.scene import Clock, Scene
@@ -77,7 +74,6 @@ def _columns(n: int) -> tuple[float, float]:
 
 def _row_by_row(n: int) -> float:
     import rerun as rr
-
     from marcha.viz.draw import new_stream
 
     values = _table(n)["acc_x"].to_list()

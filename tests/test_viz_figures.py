@@ -6,12 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
-import pytest
-
 import marcha.recording as mr
 import marcha.replay as rp
 import marcha.viz as viz
+import numpy as np
+import pytest
 from marcha.recording.errors import OutputExists, UsageError
 from marcha.viz import style
 from marcha.viz.plan import nice
@@ -145,7 +144,9 @@ def test_a_track_that_ran_away_does_not_set_the_frame() -> None:
     assert framed([away]) == [away]
 
 
-@pytest.mark.parametrize(("least", "expected"), [(0.07, 0.1), (0.1, 0.1), (0.11, 0.2), (3.0, 5.0), (51.0, 100.0)])
+@pytest.mark.parametrize(
+    ("least", "expected"), [(0.07, 0.1), (0.1, 0.1), (0.11, 0.2), (3.0, 5.0), (51.0, 100.0)]
+)
 def test_grid_spacings_are_round(least: float, expected: float) -> None:
     assert nice(least) == pytest.approx(expected)
 
@@ -162,7 +163,9 @@ def luminance(color: str) -> float:
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
 
-@pytest.mark.parametrize("color", sorted({*style.AXES, *style.RUNS, style.REFERENCE, style.THRESHOLD, style.NORM, style.STILL}))
+@pytest.mark.parametrize(
+    "color", sorted({*style.AXES, *style.RUNS, style.REFERENCE, style.THRESHOLD, style.NORM, style.STILL})
+)
 @pytest.mark.parametrize("background", BACKGROUNDS)
 def test_colours_stand_out_from_dark_and_light(color: str, background: str) -> None:
     low, high = sorted((luminance(color), luminance(background)))

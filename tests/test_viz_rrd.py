@@ -7,18 +7,17 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import marcha.recording as mr
+import marcha.replay as rp
+import marcha.viz as viz
 import numpy as np
 import polars as pl
 import pytest
 import rerun as rr
-from rerun.chunk import RrdReader
-
-import marcha.recording as mr
-import marcha.replay as rp
-import marcha.viz as viz
-from marcha.recording.selection import Selection
 from marcha.recording.errors import MarchaError, OutputExists, UsageError
-from marcha.viz.scene import BLOCK_ROWS, TIMELINE
+from marcha.recording.selection import Selection
+from marcha.viz.scene import TIMELINE
+from rerun.chunk import RrdReader
 
 RUN = "foot_9iez_foot_imu1"
 EPOCH = 1_700_000_000_000_000_000
@@ -33,18 +32,21 @@ def _strict() -> Iterator[None]:
 
 
 def walk_tables(seed: int = 0, start_ns: int = 5_000_000_000) -> dict[str, tuple[str, pl.DataFrame]]:
-    """Return a small walk: an IMU that rests, then swings eight times 1.2 m ahead (minimum jerk), and its truth."""
+    """Return a small walk: an IMU that rests, then swings eight times 1.2 m ahead (minimum jerk), and its
+    truth."""
     rng = np.random.default_rng(seed)
     n = 2_400
     s = np.arange(n) / 200.0
     t_ns = start_ns + np.arange(n) * 5_000_000
     step = np.clip(np.floor(s - 2.5), -1, 8)
-    u = np.clip((s - 2.5 - step) / 0.5, 0.0, 1.0) * ((step >= 0) & (step < 8))  # swings of 0.5 s, once a second
+    u = np.clip((s - 2.5 - step) / 0.5, 0.0, 1.0) * (
+        (step >= 0) & (step < 8)
+    )  # swings of 0.5 s, once a second
     swing = (u > 0) & (u < 1)
     position = np.zeros((n, 3))
     position[:, 0] = 1.2 * (np.clip(step, 0, 8) + u**3 * (10 - 15 * u + 6 * u**2))
     position[:, 2] = 0.1 * np.sin(np.pi * u) ** 2 * swing
-    force = np.gradient(np.gradient(position, s, axis=0), s, axis=0) + [0.0, 0.0, 9.81]
+    force = np.gradient(np.gradient(position, s, axis=0), s, axis=0) + np.array([0.0, 0.0, 9.81])
     acc = force + 0.02 * rng.normal(size=(n, 3))
     gyr = 0.002 * rng.normal(size=(n, 3))
     identity = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
@@ -159,7 +161,9 @@ def test_estimates_stand_at_the_time_that_they_speak_of(folder: Path, done: mr.R
     np.testing.assert_array_equal(z[:, 0], pose["pos_z"].to_numpy())
 
 
-def test_every_sample_is_a_point_of_the_trail_and_a_pose_of_the_foot(folder: Path, done: mr.Recording) -> None:
+def test_every_sample_is_a_point_of_the_trail_and_a_pose_of_the_foot(
+    folder: Path, done: mr.Recording
+) -> None:
     pose = done.table(f"/estimate/{RUN}/pose")
     p = pose.select("pos_x", "pos_y", "pos_z").to_numpy()
     _, trail = column(folder / "done.rrd", f"/run/{RUN}/trail", "Points3D:positions")
@@ -191,7 +195,11 @@ def test_thresholds_are_lines_on_the_statistic_and_on_the_raw_norm(folder: Path,
     low, high = float(metadata["threshold.acc_norm.min"]), float(metadata["threshold.acc_norm"])
     for base in ("/foot/imu1/acc_norm", f"/run/{RUN}/detector/acc_norm"):
         for value, entity in ((low, f"acc_norm.min_{low:g}"), (high, f"acc_norm_{high:g}")):
-            path = next(e for e in found if e.startswith(f"{base}/threshold/") and e.replace("\\", "").endswith(entity))
+            path = next(
+                e
+                for e in found
+                if e.startswith(f"{base}/threshold/") and e.replace("\\", "").endswith(entity)
+            )
             t_ns, line = column(folder / "done.rrd", path, "Scalars:scalars")
             assert line[:, 0].tolist() == [value, value]
             assert t_ns[1] - t_ns[0] == pytest.approx(done.duration_s * 1e9, abs=1)
@@ -237,7 +245,9 @@ def test_the_error_is_the_aligned_track_minus_the_reference(folder: Path, done: 
     t_ns, distance = column(folder / "done.rrd", f"/run/{RUN}/distance", "Scalars:scalars")
     _, error = column(folder / "done.rrd", f"/run/{RUN}/error", "Scalars:scalars")
     np.testing.assert_array_equal(t_ns, both["t_ns"].to_numpy())
-    np.testing.assert_allclose(distance[:, 0], np.linalg.norm(place.points(track) - truth, axis=1), atol=1e-12)
+    np.testing.assert_allclose(
+        distance[:, 0], np.linalg.norm(place.points(track) - truth, axis=1), atol=1e-12
+    )
     np.testing.assert_allclose(error @ place.rotation.T, place.points(track) - truth, atol=1e-12)
     assert 0.0 < distance.max() < 0.2
 
@@ -324,7 +334,7 @@ def test_missing_values_are_gaps(tmp_path: Path) -> None:
 
 
 def test_a_selection_limits_topics_and_time(folder: Path, done: mr.Recording, tmp_path: Path) -> None:
-    options = viz.RrdExporter.Options(topics=("/foot/imu1",), start_ns=6_000_000_000, end_ns=7_000_000_000)
+    options = Selection(topics=("/foot/imu1",), start_ns=6_000_000_000, end_ns=7_000_000_000)
     (path,) = viz.RrdExporter().export(done, tmp_path / "part.rrd", options)
     t_ns, _ = column(path, "/foot/imu1/acc", "Scalars:scalars")
     assert (t_ns.min(), t_ns.max()) == (6_000_000_000, 6_995_000_000)

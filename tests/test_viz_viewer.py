@@ -8,13 +8,12 @@ import socket
 import urllib.request
 from pathlib import Path
 
-import numpy as np
-import psutil
-import pytest
-
 import marcha.recording as mr
 import marcha.replay as rp
 import marcha.viz as viz
+import numpy as np
+import psutil
+import pytest
 from marcha.recording.errors import MarchaError
 from marcha.viz import viewer
 from marcha.viz.screenshot import screenshots
@@ -48,7 +47,8 @@ def test_no_view_complains_and_every_tab_has_a_picture(rrd: Path) -> None:
         assert picture.reports == (), picture.tab
         pixels = np.asarray(Image.open(io.BytesIO(picture.png)).convert("L"), dtype=float)
         assert pixels.shape == (900, 1600)
-        assert np.ptp(pixels) > 100 and pixels.std() > 8, f"{picture.tab} is blank"
+        assert np.ptp(pixels) > 100, f"{picture.tab} is blank"
+        assert pixels.std() > 8, f"{picture.tab} is blank"
     assert len({p.png for p in pictures}) == len(tabs)
 
 
@@ -99,5 +99,5 @@ def test_a_viewer_that_cannot_start_says_why() -> None:
     with socket.socket() as taken:
         taken.bind((viewer.HOST, 0))
         port = taken.getsockname()[1]
-        with pytest.raises(MarchaError, match="did not start: .*wrong-option"):
+        with pytest.raises(MarchaError, match=r"did not start: .*wrong-option"):
             viewer.Viewer(["--wrong-option"], port)

@@ -1,4 +1,6 @@
-"""Recordings in the Rerun viewer, and as figures: what a channel looks like, live and saved views, pictures."""
+"""Recordings in the Rerun viewer, and as figures: what a channel looks like, live and saved views,
+pictures.
+"""
 
 from __future__ import annotations
 

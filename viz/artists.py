@@ -1,8 +1,8 @@
 """What each kind of channel looks like."""
 
-from __future__ import annotations
+# ruff: noqa: D102 - begin, draw and end are documented once, in Artist
 
-from collections.abc import Sequence
+from __future__ import annotations
 
 import numpy as np
 import polars as pl
@@ -17,7 +17,8 @@ CLOSED_M = 1.0
 """Start and end closer than this have one label."""
 
 FAR_ABOVE = 5.0
-"""A statistic that rises more than so many times above its threshold is shown up to there: else the threshold is at zero."""
+"""A statistic that rises more than so many times above its threshold is shown up to there: else the
+threshold is at zero."""
 
 
 class Artist:
@@ -72,7 +73,9 @@ class Numbers(Artist):
         self.factors = [s.factor for s in shown]
         self.scene.lines(self.path, [s.name for s in shown], [style.axis_color(i) for i in range(len(shown))])
         role = "other" if is_estimate(self.channel.topic) else "raw"
-        self.scene.show(role, self.owner, f"{self.owner} {self.what}" if role == "other" else self.owner, self.path)
+        self.scene.show(
+            role, self.owner, f"{self.owner} {self.what}" if role == "other" else self.owner, self.path
+        )
 
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
         if self.names:
@@ -163,7 +166,9 @@ class Pose(Artist):
         if self.turns:
             turn = columns_of(block, self.QUATERNION)[finite]
             good = np.isfinite(turn).all(axis=1)
-            columns = rr.Transform3D.columns(translation=local[good], quaternion=turn[good].astype(np.float32))
+            columns = rr.Transform3D.columns(
+                translation=local[good], quaternion=turn[good].astype(np.float32)
+            )
             self.scene.columns(f"{self.base}/foot", t_ns[good], columns)
 
     def end(self) -> None:
@@ -221,7 +226,9 @@ class Stance(Artist):
         change = np.flatnonzero(np.diff(state, prepend=self.last))
         self.last = int(state[-1])
         names = np.array(["moving", "still", ""])  # the empty state is a gap
-        self.scene.columns(self.path, t_ns[change], rr.StateChange.columns(state=names[state[change]].tolist()))
+        self.scene.columns(
+            self.path, t_ns[change], rr.StateChange.columns(state=names[state[change]].tolist())
+        )
 
     def end(self) -> None:
         span = self.scene.span()[1:]
@@ -229,7 +236,9 @@ class Stance(Artist):
 
 
 class Values(Artist):
-    """Named values (statistics of a detector, internals of a filter): each by itself, with its own thresholds."""
+    """Named values (statistics of a detector, internals of a filter): each by itself, with its own
+    thresholds.
+    """
 
     def begin(self) -> None:
         self.shown = {c: shown_as(c) for c in self.channel.columns}
@@ -335,7 +344,8 @@ class Fix(Artist):
 
     def begin(self) -> None:
         self.scene.static(
-            self.path, rr.GeoPoints.from_fields(colors=style.rgb(style.AXES[2]), radii=rr.Radius.ui_points(4.0))
+            self.path,
+            rr.GeoPoints.from_fields(colors=style.rgb(style.AXES[2]), radii=rr.Radius.ui_points(4.0)),
         )
         self.scene.show("map", self.owner, self.owner, self.path)
 

@@ -1,6 +1,7 @@
 """Which views a recording gets, and how they are arranged.
 
-The layout follows from what the scenes show (:class:`marcha.viz.scene.Entry`), so a raw recording, one run, many runs and
+The layout follows from what the scenes show (:class:`marcha.viz.scene.Entry`), so a raw recording, one
+run, many runs and
 several recordings side by side all get the tabs they can fill: Overview, Raw, Detector, Compare, Report.
 """
 
@@ -10,6 +11,8 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import rerun.blueprint as rrb
+from rerun.blueprint.api import VisualizerLike
+from rerun.encodings import EntityPathLike
 
 from . import plan
 from .scene import TIMELINE, Entry, Floats, Scene
@@ -48,9 +51,7 @@ def blueprint(scenes: Sequence[Scene], *, live: bool = False) -> rrb.Blueprint:
         root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(
-            state="collapsed", timeline=TIMELINE, play_state="following" if live else "paused"
-        ),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following" if live else "paused"),
         auto_layout=False,
         auto_views=False,
     )
@@ -86,7 +87,10 @@ def _lanes(entries: Sequence[Entry]) -> list[rrb.StateTimelineView]:
     name = "stance" if not _of(found, "annotation") else "stance and annotations"
     return [
         rrb.StateTimelineView(
-            origin="/", contents=[e.path for e in found], name=name, time_view=rrb.TimeAxis(link="LinkToGlobal")
+            origin="/",
+            contents=[e.path for e in found],
+            name=name,
+            time_view=rrb.TimeAxis(link="LinkToGlobal"),
         )
     ]
 
@@ -95,7 +99,7 @@ def _spatial(entries: Sequence[Entry]) -> list[str]:
     return [e.path for e in _of(entries, *SPATIAL)]
 
 
-def _past(scenes: Sequence[Scene], entries: Sequence[Entry]) -> dict[str, rrb.VisibleTimeRanges]:
+def _past(scenes: Sequence[Scene], entries: Sequence[Entry]) -> dict[EntityPathLike, VisualizerLike]:
     """Return what of its past each entity shows: trails and footprints all up to the cursor."""
     boundary = rrb.TimeRangeBoundary
     end = boundary.cursor_relative()
@@ -105,7 +109,8 @@ def _past(scenes: Sequence[Scene], entries: Sequence[Entry]) -> dict[str, rrb.Vi
     )
     whole = all(t.seen <= TRAIL_ROWS for s in scenes for t in s.tracks.values())
     return {
-        e.path: past if whole or e.role == "footprints" else short for e in _of(entries, "trail", "footprints")
+        e.path: past if whole or e.role == "footprints" else short
+        for e in _of(entries, "trail", "footprints")
     }
 
 
@@ -118,7 +123,9 @@ def _space(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Spatial3DVi
         contents=_spatial(entries),
         name="track",
         eye_controls=rrb.EyeControls3D(
-            position=centre + np.array([-0.12, -0.78, 0.62]) * size, look_target=centre, eye_up=(0.0, 0.0, 1.0)
+            position=centre + np.array([-0.12, -0.78, 0.62]) * size,
+            look_target=centre,
+            eye_up=(0.0, 0.0, 1.0),
         ),
         background=rrb.Background(kind="SolidColor", color=BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=True, spacing=1.0, color=(255, 255, 255, 24)),
@@ -142,9 +149,9 @@ def _plan(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Spatial2DVie
 
 def _framed(scenes: Sequence[Scene]) -> tuple[list[Track], bool]:
     """Return the tracks that a view should be zoomed to, and whether those are all."""
-    tracks = [t for s in scenes for t in s.tracks.values() if t.count]
-    chosen = framed(tracks)
-    return chosen, len(chosen) == len(tracks)
+    tracks = [[t for t in s.tracks.values() if t.count] for s in scenes]
+    chosen = [t for own in tracks for t in framed(own)]
+    return chosen, len(chosen) == sum(len(own) for own in tracks)
 
 
 def extent(scenes: Sequence[Scene]) -> tuple[Floats, Floats]:
@@ -257,12 +264,12 @@ def _compare(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Container
 
 
 def _report(entries: Sequence[Entry]) -> rrb.Container:
-    reports = [rrb.TextDocumentView(origin=e.path, contents=[e.path], name=e.title) for e in _of(entries, "report")]
+    reports = [
+        rrb.TextDocumentView(origin=e.path, contents=[e.path], name=e.title) for e in _of(entries, "report")
+    ]
     documents = reports[0] if len(reports) == 1 else rrb.Tabs(*reports)
     events = [e.path for e in _of(entries, "log")]
     if not events:
         return rrb.Vertical(documents, name="Report")
     log = rrb.TextLogView(origin="/", contents=events, name="steps and annotations")
     return rrb.Horizontal(documents, log, column_shares=[3, 2], name="Report")
-
-

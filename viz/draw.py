@@ -32,8 +32,8 @@ def new_stream() -> rr.RecordingStream:
 def clock_of(recs: Sequence[Recording]) -> list[Clock]:
     """Return the clock of every recording.
 
-    One recording keeps its own time. Several that overlap in time share it; several of different days are laid on each
-    other, each from its own start, or their plots would be points in an empty year.
+    One recording keeps its own time. Several that overlap in time share it; several of different days are
+    laid on each other, each from its own start, or their plots would be points in an empty year.
     """
     starts, ends = [rec.start_ns or 0 for rec in recs], [rec.end_ns or 0 for rec in recs]
     clocks = [
@@ -46,7 +46,9 @@ def clock_of(recs: Sequence[Recording]) -> list[Clock]:
 
 
 def clock_from(t_ns: int, said: str = "") -> Clock:
-    """Return the clock of a recording that begins at ``t_ns``; ``said`` is what its metadata calls its clock."""
+    """Return the clock of a recording that begins at ``t_ns``; ``said`` is what its metadata calls its
+    clock.
+    """
     if said == "device" or (not said and t_ns < EPOCH_NS):
         return Clock("duration")
     return Clock("timestamp")
@@ -120,4 +122,6 @@ def check_whole(file: AtomicFile) -> None:
 def prefixes_of(recs: Sequence[Recording]) -> list[str]:
     """Return one entity prefix a recording: its file's name, numbered where two are alike."""
     names = [rec.path.stem for rec in recs]
-    return [f"/{n}" if names.count(n) == 1 else f"/{n}-{names[: i + 1].count(n)}" for i, n in enumerate(names)]
+    return [
+        f"/{n}" if names.count(n) == 1 else f"/{n}-{names[: i + 1].count(n)}" for i, n in enumerate(names)
+    ]

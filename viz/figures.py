@@ -1,6 +1,7 @@
 """Figures of a recording for papers and pages: PNG and SVG, the same bytes for the same recording.
 
-Matplotlib's object interface is used throughout; its global state (pyplot, rcParams) stays as the caller has it.
+Matplotlib's object interface is used throughout; its global state (pyplot, rcParams) stays as the caller
+has it.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ def figure(recs: Recording | Sequence[Recording], *, alignment: str = ALIGNMENT)
     Parameters
     ----------
     recs : Recording or sequence of Recording
-        With estimates, or raw (then only the signals are drawn). Several get one row each: tracks, height, errors.
+        With estimates, or raw (then only the signals are drawn). Several get one row each: tracks, height,
+        errors.
     alignment : str
         How tracks are laid upon the reference; see :func:`marcha.replay.alignment.align`.
 
@@ -61,7 +63,7 @@ def figure(recs: Recording | Sequence[Recording], *, alignment: str = ALIGNMENT)
     if len(scenes) == 1:
         _one(fig, scenes[0])
         return fig
-    for row, scene in zip(np.atleast_1d(fig.subfigures(len(scenes), 1)), scenes, strict=True):
+    for row, scene in zip(fig.subfigures(len(scenes), 1, squeeze=False)[:, 0], scenes, strict=True):
         row.suptitle(scene.rec.path.stem, fontsize=11, fontweight="bold")
         plan, *others = row.subplots(1, 3 if scene.with_errors else 2)
         _plan(plan, scene)
@@ -178,7 +180,7 @@ def _one(fig: Figure, scene: _Scene) -> None:
     signals: Any = fig
     panels = [_signals]
     if scene.shown:
-        left, signals = fig.subfigures(1, 2, width_ratios=[1.0, 1.1])
+        left, signals = fig.subfigures(1, 2, squeeze=False, width_ratios=[1.0, 1.1])[0]
         ax = left.subplots()
         _plan(ax, scene)
         left.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)

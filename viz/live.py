@@ -36,8 +36,8 @@ def show(
     web : bool
         In the browser, served to this machine only.
     wait : bool, optional
-        Return only when the viewer has been closed (the web viewer: on Ctrl-C). By default a native viewer stays open
-        by itself, and the web viewer is waited for.
+        Return only when the viewer has been closed (the web viewer: on Ctrl-C). By default a native viewer
+        stays open by itself, and the web viewer is waited for.
     open_browser : bool
         Whether to open a browser window by itself.
     opened : callable, optional
@@ -145,7 +145,9 @@ class LiveSink:
             self._begun(int(table["t_ns"][0])).write(topic, table)
 
     def close(self, result: ReplayResult | None) -> None:
-        """Draw what needs the whole, and put the file in its place; ``result`` is None where the replay failed."""
+        """Draw what needs the whole, and put the file in its place; ``result`` is None where the replay
+        failed.
+        """
         import rerun as rr
 
         from .blueprint import blueprint, extent

@@ -44,9 +44,7 @@ def log_plan(stream: rr.RecordingStream, low: Floats, high: Floats) -> None:
         static=True,
     )
     lines = [[(x, ys[0], z), (x, ys[-1], z)] for x in xs] + [[(xs[0], y, z), (xs[-1], y, z)] for y in ys]
-    stream.log(
-        GRID, rr.LineStrips3D(lines, colors=(*GREY, 90), radii=rr.Radius.ui_points(0.5)), static=True
-    )
+    stream.log(GRID, rr.LineStrips3D(lines, colors=(*GREY, 90), radii=rr.Radius.ui_points(0.5)), static=True)
     beside = 0.4 * spacing  # a name at a line's end would lie on it
     ticks = [(x, ys[0] - beside, z) for x in xs] + [(xs[0] - beside, y, z) for y in ys]
     stream.log(

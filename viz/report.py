@@ -6,7 +6,8 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 
-from ..recording import Recording, open as open_recording
+from ..recording import Recording
+from ..recording import open as open_recording
 from ..recording.errors import MarchaError
 from ..replay import ReplayResult, evaluate
 
@@ -74,7 +75,7 @@ def _metrics(rec: Recording) -> list[str]:
     for run in runs:
         if run.alignment:
             parts += [
-                f"{run.run}: {run.matched} samples compared with the reference, {run.dropped} without a partner, "
+                f"{run.run}: {run.matched} samples compared with the reference, {run.dropped} left out, "
                 f"alignment {run.alignment}.",
                 "",
             ]

@@ -8,9 +8,9 @@ from typing import ClassVar
 
 import msgspec
 
-from ..recording.selection import Selection
 from ..recording import Recording
 from ..recording.atomic import AtomicFile
+from ..recording.selection import Selection
 
 
 def write_rrd(

@@ -1,24 +1,24 @@
 """One recording on one Rerun stream: channels become entities, logged in columns.
 
 A :class:`Scene` draws one recording (read from a file or arriving live). Each channel has an artist
-(:mod:`marcha.viz.artists`), chosen by its message type, which logs its style once, its rows in blocks, and what can only
-be drawn when all is known (the whole track) at the end.
+(:mod:`marcha.viz.artists`), chosen by its message type, which logs its style once, its rows in blocks, and
+what can only be drawn when all is known (the whole track) at the end.
 
 Entities, below a prefix of the recording's own where several are shown together:
 
 ========================  =====================================================================
 ``/<topic>/…``            raw signals: ``acc``, ``gyr``, ``acc_norm``, ``gyr_norm``, ``mag`` …
-``/run/<run>/…``          one run: ``track`` (whole), ``trail`` (one point a sample), ``foot`` (axes of the body),
-                          ``height``, ``velocity``, ``speed``, ``stance``, ``detector/<statistic>``, ``sigma/<what>``,
-                          ``step``, ``footprints``, ``error/<axis>``, ``distance``, ``mark`` (start, end, name)
+``/run/<run>/…``          one run: ``track`` (whole), ``trail`` (one point a sample), ``foot`` (the body's axes),
+                          ``height``, ``velocity``, ``speed``, ``stance``, ``detector/<statistic>``,
+                          ``sigma/<what>``, ``step``, ``footprints``, ``error``, ``distance``, ``mark`` (names)
 ``/reference/…``          the same for the truth, where there is one
 ``/annotation/<tier>``    lanes of labelled intervals
 ``/log``                  steps and annotations as text
 ``/report``               metrics, parameters and findings
 ========================  =====================================================================
 
-The only time line is ``time``: nanoseconds since the epoch, or since the device's own zero. Estimates stand at
-the time that they speak of, not at the time when they were known.
+The only time line is ``time``: nanoseconds since the epoch, or since the device's own zero. Estimates
+stand at the time that they speak of, not at the time when they were known.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ BLOCK_ROWS = 1000
 """Rows a block: small enough for bounded memory, large enough for speed (measured: 2.5 million rows/s)."""
 
 ALIGNMENT = "origin-yaw"
-"""Tracks start together and in one direction, so that what is seen (and what sigma speaks of) is the drift since then."""
+"""Tracks start together and in one direction, so that what is seen (and what sigma speaks of) is the drift
+since then."""
 
 FAR_M = 1e4
 """Positions farther from zero than this are logged relative to a local origin: Rerun's 3D is float32."""
@@ -107,8 +108,10 @@ class Entry:
     Attributes
     ----------
     role : str
-        What kind of view: ``raw``, ``norm``, ``track``, ``trail``, ``foot``, ``mark``, ``footprints``, ``height``, ``velocity``,
-        ``speed``, ``stance``, ``detector``, ``sigma``, ``error``, ``distance``, ``step``, ``annotation``, ``other``.
+        What kind of view: ``raw``, ``norm``, ``track``, ``trail``, ``foot``, ``mark``, ``footprints``,
+        ``height``, ``velocity``,
+        ``speed``, ``stance``, ``detector``, ``sigma``, ``error``, ``distance``, ``step``, ``annotation``,
+        ``other``.
     owner : str
         The sensor, run or reference that it belongs to.
     title : str
@@ -221,7 +224,9 @@ class Scene:
             self.entries.append(Entry(role, owner, title, path))
 
     def origin(self, first: Floats) -> Floats:
-        """Return the local origin for positions that begin at ``first`` (3,), in metres: zero unless far away."""
+        """Return the local origin for positions that begin at ``first`` (3,), in metres: zero unless far
+        away.
+        """
         if self._origin is None:
             self._origin = np.round(first) if np.abs(first).max() > FAR_M else np.zeros(3)
         near = np.abs(first - self._origin).max() <= FAR_M
@@ -252,7 +257,8 @@ class Scene:
         self.show("report", self.prefix[1:], self.prefix[1:] or "report", f"{self.prefix}/report")
 
     def annotate(self, annotations: pl.DataFrame) -> None:
-        """Draw labelled intervals (``tier, start_ns, end_ns, label``): a lane and lines in the log for each tier.
+        """Draw labelled intervals (``tier, start_ns, end_ns, label``): a lane and lines in the log for
+        each tier.
 
         Stances and steps that a replay wrote are left out: the run's own channels show them.
         """
@@ -261,7 +267,11 @@ class Scene:
                 continue
             path, log = f"{self.prefix}/annotation/{tier}", f"{self.prefix}/log/annotation/{tier}"
             rows = rows.sort("start_ns")
-            start, end, labels = rows["start_ns"].to_numpy(), rows["end_ns"].to_numpy(), rows["label"].to_list()
+            start, end, labels = (
+                rows["start_ns"].to_numpy(),
+                rows["end_ns"].to_numpy(),
+                rows["label"].to_list(),
+            )
             # an interval that another one follows at once needs no gap between them
             gap = np.flatnonzero(~np.isin(end, start))
             times = np.concatenate([start, end[gap]])
@@ -269,7 +279,8 @@ class Scene:
             order = np.argsort(times, kind="stable")
             self.columns(path, times[order], rr.StateChange.columns(state=[states[i] for i in order]))
             text = [
-                f"{tier}: {label}, {(b - a) / 1e9:.2f} s" for label, a, b in zip(labels, start, end, strict=True)
+                f"{tier}: {label}, {(b - a) / 1e9:.2f} s"
+                for label, a, b in zip(labels, start, end, strict=True)
             ]
             self.columns(log, start, rr.TextLog.columns(text=text, level=["INFO"] * len(text)))
             self.show("annotation", str(tier), str(tier), path)
@@ -296,7 +307,8 @@ class Scene:
     def _compare(self) -> None:
         """Turn every run's track onto the reference and log its error over time."""
         reference = self.tracks.get(f"{self.prefix}/reference") or next(
-            (t for g, t in self.tracks.items() if g.startswith(f"{self.prefix}/reference/") and t.count > 1), None
+            (t for g, t in self.tracks.items() if g.startswith(f"{self.prefix}/reference/") and t.count > 1),
+            None,
         )
         if reference is None:
             return
@@ -335,7 +347,9 @@ def is_second_reference(topic: str) -> bool:
 
 
 def thresholds_of(channel: ChannelLike) -> Iterator[Threshold]:
-    """Read ``threshold.<statistic>`` and ``threshold.<statistic>.min`` (a floor) from a channel's metadata."""
+    """Read ``threshold.<statistic>`` and ``threshold.<statistic>.min`` (a floor) from a channel's
+    metadata.
+    """
     for key, text in channel.metadata.items():
         name = key.removeprefix("threshold.")
         if name == key:

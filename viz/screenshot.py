@@ -63,7 +63,8 @@ def screenshots(
     Raises
     ------
     MarchaError
-        No graphics (Debian: mesa-vulkan-drivers and libvulkan1), the recording did not load, or it has no such tab.
+        No graphics (Debian: mesa-vulkan-drivers and libvulkan1), the recording did not load, or it has no
+        such tab.
     """
     import numpy as np
     from rerun.experimental import ViewerClient

@@ -1,6 +1,7 @@
 """Colours, names and units of everything drawn, the same in the viewer and in the figures.
 
-The palette starts from Okabe and Ito (2008), which people with colour-vision deficiencies can tell apart; its yellow and
+The palette starts from Okabe and Ito (2008), which people with colour-vision deficiencies can tell apart;
+its yellow and
 black are left out and the others moved in lightness until each has a contrast of 3:1 or more both on white
 and on the viewer's dark background (WCAG 2.1, non-text contrast).
 """

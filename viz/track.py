@@ -20,7 +20,8 @@ LARGER = 1.5
 """A track so many times larger than the smallest one has run away."""
 
 ASTRAY = 0.2
-"""And so has one that is farther from its reference than this share of its own size: filters drift a hundredth of it."""
+"""And so has one that is farther from its reference than this share of its own size: filters drift a
+hundredth of it."""
 
 SPARSE_S = 0.3
 """Points farther apart in time are places."""
@@ -154,8 +155,8 @@ def compare(track: Track, reference: Track, alignment: str, max_gap_s: float = 0
     alignment : str
         See :func:`marcha.replay.alignment.align`.
     max_gap_s : float
-        Positions are not interpolated over longer gaps. Where the reference itself is sparser (footprints), it is
-        compared at its own times.
+        Positions are not interpolated over longer gaps. Where the reference itself is sparser
+        (footprints), it is compared at its own times.
 
     Returns
     -------

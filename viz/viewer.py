@@ -1,7 +1,7 @@
 """Viewer processes, native and web, that listen on this machine only.
 
-Rerun's own ``spawn`` and ``serve_web_viewer`` bind all interfaces of the machine, so the bundled program is started here
-with ``--bind 127.0.0.1``.
+Rerun's own ``spawn`` and ``serve_web_viewer`` bind all interfaces of the machine, so the bundled program
+is started here with ``--bind 127.0.0.1``.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Viewer:
 
     def __init__(self, arguments: Sequence[str], port: int, address: str = "") -> None:
         self.port, self.address = port, address
-        self._said = tempfile.TemporaryFile()
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the process
         self._process = subprocess.Popen(
             [sys.executable, "-m", "rerun_cli", *arguments],
             stdout=self._said,
@@ -72,8 +72,8 @@ class Viewer:
         self.close()
         self._said.seek(0)
         lines = [line for line in self._said.read().decode(errors="replace").splitlines() if line.strip()]
-        said = next((line for line in lines if "error" in line.lower()), lines[-1] if lines else "it said nothing")
-        raise MarchaError(f"the Rerun viewer did not start: {said}")
+        lines = [line for line in lines if "error" in line.lower()] or lines or ["it said nothing"]
+        raise MarchaError(f"the Rerun viewer did not start: {lines[0]}")
 
     @property
     def running(self) -> bool:
