@@ -10,7 +10,7 @@ from .options import DEFAULT, Common
 
 
 def completion(
-    shell: Literal["bash", "zsh", "fish", "powershell"] | None = None,
+    shell: Literal["zsh", "bash", "fish", "powershell"] | None = None,
     /,
     *,
     show: bool = False,

@@ -155,7 +155,7 @@ def simulate(
             facts.write(msgspec.toml.encode(_facts(simulation, line, format)))
     except OSError as error:
         raise MarchaError(
-            f"{error.filename or folder}: cannot write: {error.strerror}; nothing was written"
+            f"{error.filename or folder}: cannot write: {error.strerror or error}; nothing was written"
         ) from error
     return Simulated([log], truths, rows, simulation.route.closed, simulation.length_m)
 
