@@ -97,6 +97,26 @@ def draw(
     return scenes
 
 
+def finish(stream: rr.RecordingStream, file: AtomicFile | None) -> None:
+    """Send what is pending, end the stream, and make sure that its file, if any, is whole.
+
+    Raises
+    ------
+    MarchaError
+        The file cannot be written, or the viewer went away; nothing is left.
+    """
+    try:
+        stream.flush()
+        stream.disconnect()
+    except RuntimeError as error:  # the thread behind a sink is gone
+        if file is None:
+            raise MarchaError(f"the viewer went away: {error}") from None
+        file.abort()
+        raise MarchaError(f"{file.path}: not written whole (is the disk full?): {error}") from None
+    if file is not None:
+        check_whole(file)
+
+
 def check_whole(file: AtomicFile) -> None:
     """Make sure that a written ``.rrd`` ends as it should: Rerun only logs what its file sink cannot write.
 

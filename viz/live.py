@@ -151,7 +151,7 @@ class LiveSink:
         import rerun as rr
 
         from .blueprint import blueprint, extent
-        from .draw import check_whole
+        from .draw import finish
         from .plan import log_plan
         from .report import replay_report
 
@@ -166,10 +166,7 @@ class LiveSink:
             log_plan(self._stream, *extent([scene]))
             # the saved view opens at the whole track; open viewers keep what their user has arranged
             self._stream.send_blueprint(blueprint([scene]), make_active=False)
-            self._stream.flush()
-            self._stream.disconnect()
-            if self._file is not None:
-                check_whole(self._file)
+            finish(self._stream, self._file)
         except BaseException:
             self._abort()
             raise

@@ -52,14 +52,12 @@ def write_rrd(
     try:
         import rerun as rr
 
-        from .draw import check_whole, draw, new_stream
+        from .draw import draw, finish, new_stream
 
         stream = new_stream()
         stream.set_sinks(rr.FileSink(file.part))
         draw(recs, stream, selection)
-        stream.flush()
-        stream.disconnect()
-        check_whole(file)
+        finish(stream, file)
     except BaseException:
         file.abort()
         raise

@@ -8,9 +8,9 @@ Entities, below a prefix of the recording's own where several are shown together
 
 ========================  =====================================================================
 ``/<topic>/…``            raw signals: ``acc``, ``gyr``, ``acc_norm``, ``gyr_norm``, ``mag`` …
-``/run/<run>/…``          one run: ``track`` (whole), ``trail`` (one point a sample), ``foot`` (the body's axes),
+``/run/<run>/…``          one run: ``track`` (whole), ``trail`` (one point a sample), ``foot`` (its axes),
                           ``height``, ``velocity``, ``speed``, ``stance``, ``detector/<statistic>``,
-                          ``sigma/<what>``, ``step``, ``footprints``, ``error``, ``distance``, ``mark`` (names)
+                          ``sigma/<what>``, ``step``, ``footprints``, ``error``, ``distance``, ``mark``
 ``/reference/…``          the same for the truth, where there is one
 ``/annotation/<tier>``    lanes of labelled intervals
 ``/log``                  steps and annotations as text

@@ -44,11 +44,11 @@ class Viewer:
     port : int
         Where it listens for data.
     address : str
-        What to open in a browser; empty for the native viewer.
+        What to open in a browser; of the native viewer, where it takes data.
     """
 
     def __init__(self, arguments: Sequence[str], port: int, address: str = "") -> None:
-        self.port, self.address = port, address
+        self.port, self.address = port, address or uri(port)
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the process
         self._process = subprocess.Popen(
             [sys.executable, "-m", "rerun_cli", *arguments],
