@@ -156,6 +156,13 @@ def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
         find_sources(parse(MINIMAL, tmp_path), tmp_path / "nowhere", "code")
 
 
+def test_what_a_walk_knows_of_itself_counts(tmp_path: Path) -> None:
+    data = folder_of(tmp_path, "a.csv", "b.csv", "b.truth.toml")
+    config = parse(MINIMAL.replace("[[", "truth = [{ length_m = 22.1 }]\n[[", 1), tmp_path)
+    options = {s.name: s.options for s in find_sources(config, data, "code")[0]}
+    assert options == {"a": {"length_m": 22.1}, "b": {}}
+
+
 @pytest.mark.parametrize("change", ["content", "code", "parameter", "truth"])
 def test_a_cell_is_another_one_when_anything_it_depends_on_changes(tmp_path: Path, change: str) -> None:
     data = folder_of(tmp_path, "a.csv")

@@ -6,6 +6,7 @@ the inputs, the estimator with its parameters, and the code. Cells with a known 
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import inspect
 import random
@@ -196,14 +197,16 @@ def _files(
 
 
 def _source(recordings: cfg.Recordings, name: str, path: Path, code: str) -> Source:
-    known = cfg.truth(recordings, path.name)
-    truth = {k: v for k, v in (("closed", known.closed), ("length_m", known.length_m)) if v is not None}
     raw = path.suffix != ".mcap"
+    beside = sorted(path.parent.glob(f"{glob.escape(path.stem)}.truth.*")) if raw else []
+    known = cfg.Truth() if beside else cfg.truth(recordings, path.name)  # what a walk knows of itself counts
+    truth = {k: v for k, v in (("closed", known.closed), ("length_m", known.length_m)) if v is not None}
     options = {**truth, **recordings.options} if raw else truth
+    content = [file_digest(p) for p in (path, *beside)]
     return Source(
         name=name,
         kind="raw" if raw else "mcap",
-        digest=digest(file_digest(path), path.name, recordings.format if raw else None, options, code),
+        digest=digest(content, path.name, recordings.format if raw else None, options, code),
         path=str(path.resolve()),
         format=recordings.format if raw else None,
         options=options,
