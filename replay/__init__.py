@@ -9,7 +9,7 @@ from .feed import GapPolicy
 from .metrics import RunView, Truth, nees_bounds
 from .plan import EstimatorSpec, Plan, PlannedRun, parse_estimator, plan_runs
 from .sinks import RecordingSink, Sink, TableSink
-from .sources import Batch, LiveSource, PlannedChannel, RecordingSource, Source
+from .sources import Batch, LiveSource, PlannedChannel, RecordingSource, Source, SourceFailed
 
 __all__ = [
     "ALIGNMENTS",
@@ -32,6 +32,7 @@ __all__ = [
     "RunView",
     "Sink",
     "Source",
+    "SourceFailed",
     "SystemClock",
     "TableSink",
     "Truth",

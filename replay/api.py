@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from ..algorithms.contract import Estimator
 from ..recording import Recording
 from ..recording import open as open_recording
 from ..recording.errors import OutputExists, UsageError
@@ -17,14 +16,14 @@ from .clock import Clock
 from .engine import Engine, Progress, ReplayResult, Run
 from .evaluate import evaluate, evaluate_run, recording_view
 from .feed import GapPolicy
-from .plan import EstimatorSpec, plan_runs
+from .plan import EstimatorLike, plan_runs
 from .sinks import RecordingSink, Sink, TableSink
-from .sources import RecordingSource, Source
+from .sources import RecordingSource, Source, SourceFailed
 
 
 def replay(
     recording: Recording | Source,
-    estimators: Sequence[str | EstimatorSpec | Estimator | type],
+    estimators: Sequence[EstimatorLike],
     params: Mapping[str, Any] | None = None,
     *,
     inputs: Sequence[str] | None = None,
@@ -89,6 +88,8 @@ def replay(
     ------
     UsageError
         Unknown names, parameters or topics; a missing column; ``out`` is the input.
+    SourceFailed
+        A live source broke off; ``out`` holds what it delivered before.
     OutputExists
         ``out`` is there and ``overwrite`` is false.
     """
@@ -136,9 +137,18 @@ def replay(
         checkpoint_s=None,
         progress=progress,
     )
+    failure: SourceFailed | None = None
     with engine:
-        engine.play()
+        try:
+            engine.play()
+        except KeyboardInterrupt:  # the way to end a live session: keep what was heard
+            if source.seekable:
+                raise
+        except SourceFailed as error:
+            failure = error
         result = engine.finish(complete)
+    if failure is not None:
+        raise failure
     if target is not None and tables is None and metrics:
         with open_recording(target) as written:
             found = evaluate(written, runs=[r.run for r in result.runs], intervals=False)

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from ..algorithms import find, make
-from ..algorithms.contract import AlgorithmError, Estimator, Input, Output
+from ..algorithms.contract import AlgorithmError, Estimator, Input, Output, PlainEstimator
 from ..recording.errors import Finding, UsageError
 from .sources import PlannedChannel, Source
 
@@ -41,6 +41,10 @@ class EstimatorSpec(msgspec.Struct, frozen=True):
     name: str
     params: dict[str, Any] = {}
     label: str = ""
+
+
+EstimatorLike = str | EstimatorSpec | PlainEstimator | Estimator | type
+"""What the user may name an estimator by: its name, a specification, an instance or a class."""
 
 
 def parse_estimator(text: str) -> EstimatorSpec:
@@ -164,7 +168,7 @@ class Plan:
 
 def plan_runs(
     source: Source,
-    estimators: Sequence[str | EstimatorSpec | Estimator | type],
+    estimators: Sequence[EstimatorLike],
     params: Mapping[str, Any] | None = None,
     inputs: Sequence[str] | None = None,
     taken: Sequence[str] = (),
@@ -241,7 +245,7 @@ def plan_runs(
 class _Maker:
     """Builds fresh instances of one estimator that the user asked for."""
 
-    def __init__(self, asked: str | EstimatorSpec | Estimator | type, params: Mapping[str, Any]) -> None:
+    def __init__(self, asked: EstimatorLike, params: Mapping[str, Any]) -> None:
         self.label = ""
         if isinstance(asked, str):
             asked = parse_estimator(asked)

@@ -107,6 +107,10 @@ def measured_rate(t_ns: np.ndarray) -> float:
     return float(1e9 / usual.mean())
 
 
+class SourceFailed(MarchaError):
+    """A live source broke off. What it delivered before is recorded all the same."""
+
+
 class RecordingSource:
     """Messages of a recording, or of a part of its topics.
 
@@ -193,6 +197,7 @@ class LiveSource:
             capacity
         )
         self._closed = False
+        self._failure: BaseException | None = None
         if messages is not None:
             threading.Thread(target=self._pump, args=(messages,), daemon=True, name="live source").start()
 
@@ -251,6 +256,8 @@ class LiveSource:
             tables = {t: self._table(t, r) for t, r in rows.items() if r}
             if tables:
                 yield Batch(latest, tables)
+        if self._failure is not None:
+            raise SourceFailed(f"live source {self.name} failed: {self._failure}") from self._failure
 
     def _arrived(self) -> list[tuple[str, int, Sequence[float]]]:
         """Wait for one message, then take all that are there."""
@@ -260,10 +267,10 @@ class LiveSource:
             if item is None:
                 self._closed = True
                 return messages
-            if isinstance(item, MarchaError):
-                raise item
             if isinstance(item, BaseException):
-                raise MarchaError(f"live source {self.name} failed: {item}") from item
+                self._failure = item
+                self._closed = True
+                return messages
             messages.append(item)
             try:
                 item = self._queue.get_nowait()

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
+import marcha.recording as mr
+import numpy as np
 import polars as pl
 import pytest
-from marcha.recording import MarchaError, UsageError
-from marcha.replay import LiveSource, PlannedChannel
+from marcha.recording import UsageError
+from marcha.replay import LiveSource, PlannedChannel, SourceFailed, replay
 
 from .replay_helpers import (
     ACC,
@@ -88,9 +91,30 @@ def failing() -> Iterator[tuple[str, int, list[float]]]:
     raise OSError("device unplugged")
 
 
-def test_a_device_that_fails_is_one_line() -> None:
-    with pytest.raises(MarchaError, match="device unplugged"):
-        run_all(LiveSource([LEFT], failing()), [Echo()])
+def test_a_device_that_fails_is_one_line_and_loses_nothing(tmp_path: Path) -> None:
+    with pytest.raises(SourceFailed, match="device unplugged"):
+        replay(LiveSource([LEFT], failing()), [Echo()], out=tmp_path / "live.mcap")
+    assert mr.open(tmp_path / "live.mcap").channels["/left/imu"].count == 1
+
+
+def interrupted() -> Iterator[tuple[str, int, list[float]]]:
+    yield "/left/imu", 1, [1.0] * 3
+
+
+class Interrupting(Echo):
+    def step(self, row: np.ndarray) -> np.ndarray:
+        raise KeyboardInterrupt
+
+
+def test_an_interrupt_ends_a_live_session_and_keeps_it(tmp_path: Path) -> None:
+    replay(LiveSource([LEFT], interrupted()), [Interrupting()], out=tmp_path / "live.mcap")
+    assert mr.open(tmp_path / "live.mcap").channels["/left/imu"].count == 1
+
+
+def test_an_interrupt_of_a_recording_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        replay(MemorySource(tables()), [Interrupting()], out=tmp_path / "out.mcap")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("topic", "values"), [("/hand/imu", [1.0] * 3), ("/left/imu", [1.0] * 2)])
