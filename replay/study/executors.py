@@ -120,7 +120,9 @@ class Executor:
                 pool.shutdown()
                 yield from _one_by_one(function, lost)
                 lost = []
-                pool = self._pool = _start(self.processes)
+                self._pool = None
+                if waiting:
+                    pool = self._pool = _start(self.processes)
 
 
 def _attempt(function: Callable[[T], R], task: T) -> R | Exception:
