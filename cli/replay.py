@@ -23,6 +23,7 @@ def replay(
     speed: Annotated[str, Shown] = "max",
     start: Annotated[str | None, Parameter(name="--from")] = None,
     end: Annotated[str | None, Parameter(name="--to")] = None,
+    gap: Annotated[Literal["bridge", "reset", "stop"], Shown] = "bridge",
     output: MaybeOutput = None,
     rrd: Path | None = None,
     show: bool = False,
@@ -50,6 +51,8 @@ def replay(
         Start here: 12.5, 12.5s, 1m, 500ms after the recording's start, or @NANOSECONDS of its clock.
     end : str
         Stop before here; written like --from.
+    gap : str
+        What a pause of the input does: bridge it, reset the estimator after it, or stop before it.
     output : Path
         Recording to write: everything that was in the input, and the estimates.
     rrd : Path
@@ -80,6 +83,8 @@ def replay(
             out=output,
             overwrite=force,
             sinks=sinks,
+            gap=gap,
+            keep_tables=output is None,  # with a file, memory stays bounded and metrics come from there
             progress=report,
         )
     runs = [
