@@ -160,11 +160,11 @@ class Pose(Artist):
         if self.zero is None:
             self.zero = self.scene.origin(position[0])
         position -= self.zero
-        self.track.add(t_ns, position)
+        turn = columns_of(block, self.QUATERNION)[finite] if self.turns else None
+        self.track.add(t_ns, position, None if turn is None else turn[:, [3, 0, 1, 2]])
         local = position.astype(np.float32)
         self.scene.columns(f"{self.base}/trail", t_ns, rr.Points3D.columns(positions=local))
-        if self.turns:
-            turn = columns_of(block, self.QUATERNION)[finite]
+        if turn is not None:
             good = np.isfinite(turn).all(axis=1)
             columns = rr.Transform3D.columns(
                 translation=local[good], quaternion=turn[good].astype(np.float32)

@@ -162,7 +162,9 @@ def _scene(rec: Recording, alignment: str) -> _Scene:
         found[chosen] = Track("reference", style.REFERENCE)
     for window in rec.windows(list(found)) if found else ():
         for topic, table in window.tables.items():
-            found[topic].add(table["t_ns"].to_numpy(), table.select("pos_x", "pos_y", "pos_z").to_numpy())
+            position = table.select("pos_x", "pos_y", "pos_z").to_numpy()
+            turn = table.select([f"quat_{a}" for a in "wxyz"]).to_numpy() if "quat_w" in table else None
+            found[topic].add(table["t_ns"].to_numpy(), position, turn)
     tracks = {t.split("/")[2]: found[t] for t in runs if found[t].count}
     reference = found[chosen] if chosen is not None and found[chosen].count else None
     compared: dict[str, Compared] = {}

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..replay.alignment import Transform, align, match
+from ..replay.alignment import Transform, align, match, yaw_of
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -51,21 +51,29 @@ class Track:
         self.worst_m = 0.0
         self._t: list[Times] = []
         self._p: list[Floats] = []
+        self._yaw: list[Floats] = []
         self._stride, self.seen, self.count = 1, 0, 0
 
-    def add(self, t_ns: Times, positions: Floats) -> None:
-        """Append positions (n, 3) in metres; rows that are not finite are left out."""
+    def add(self, t_ns: Times, positions: Floats, quat_wxyz: Floats | None = None) -> None:
+        """Append positions (n, 3) in metres and orientations (n, 4); rows without a position are left out."""
         keep = np.isfinite(positions).all(axis=1)
         t_ns, positions = t_ns[keep], positions[keep]
+        yaw = np.full(len(t_ns), np.nan) if quat_wxyz is None else yaw_of(quat_wxyz[keep])
         first = -self.seen % self._stride
         self.seen += len(t_ns)
         self._t.append(t_ns[first :: self._stride])
         self._p.append(positions[first :: self._stride])
+        self._yaw.append(yaw[first :: self._stride])
         self.count += len(self._t[-1])
         while self.count > LIMIT:
-            self._t, self._p = [self.t_ns[::2]], [self.positions[::2]]
+            self._t, self._p, self._yaw = [self.t_ns[::2]], [self.positions[::2]], [self.yaw[::2]]
             self._stride *= 2
             self.count = len(self._t[0])
+
+    @property
+    def yaw(self) -> Floats:
+        """Headings (n,), rad; NaN where the orientation is not known."""
+        return np.concatenate(self._yaw) if self._yaw else np.empty(0)
 
     @property
     def shown(self) -> Floats:
@@ -164,16 +172,20 @@ def compare(track: Track, reference: Track, alignment: str, max_gap_s: float = 0
         None where fewer than two times have a partner.
     """
     t_ns, once = np.unique(track.t_ns, return_index=True)
-    p = track.positions[once]
+    p, yaw = track.positions[once], track.yaw[once]
     t_ref, once = np.unique(reference.t_ns, return_index=True)
-    q = reference.positions[once]
-    if len(t_ref) > 1 and float(np.median(np.diff(t_ref))) > max_gap_s * 1e9:  # surveyed points
-        found = match(t_ref, t_ns, max_gap_s)
-        t_ns, p, q = t_ref[found.index], found.linear(p) if len(found.index) else p[:0], q[found.index]
-    else:
-        found = match(t_ns, t_ref, max_gap_s)
-        t_ns, p, q = t_ns[found.index], p[found.index], found.linear(q) if len(found.index) else q[:0]
-    if len(t_ns) < 2:
+    q, yaw_ref = reference.positions[once], reference.yaw[once]
+    # positions are interpolated in the denser track, at the times of the sparser one
+    sparse = len(t_ref) > 1 and float(np.median(np.diff(t_ref))) > max_gap_s * 1e9
+    found = match(t_ref, t_ns, max_gap_s) if sparse else match(t_ns, t_ref, max_gap_s)
+    if len(found.index) < 2:
         return None
-    place = align(p, q, alignment)
+    if sparse:
+        t_ns, p, q = t_ref[found.index], found.linear(p), q[found.index]
+        yaw, yaw_ref = found.angle(yaw), yaw_ref[found.index]
+    else:
+        t_ns, p, q = t_ns[found.index], p[found.index], found.linear(q)
+        yaw, yaw_ref = yaw[found.index], found.angle(yaw_ref)
+    start = (float(yaw[0]), float(yaw_ref[0])) if np.isfinite([yaw[0], yaw_ref[0]]).all() else (None, None)
+    place = align(p, q, alignment, *start)
     return Compared(place, t_ns, (place.points(p) - q) @ place.rotation)
