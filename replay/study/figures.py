@@ -187,8 +187,10 @@ def qq(frame: pl.DataFrame, config: cfg.StudyConfig) -> Figure | None:
         ax.set_title(configuration)
     for ax in axes[len(groups) :]:
         ax.set_visible(False)
-    figure.supxlabel("quantiles of the standard normal distribution")
-    figure.supylabel("standardized values")
+    for ax in axes[max(0, len(groups) - columns) : len(groups)]:
+        ax.set_xlabel("quantile of the normal distribution")
+    for ax in axes[::columns]:
+        ax.set_ylabel("standardized value")
     drawn = [k for k, f in enumerate(filters) if any(f in samples for samples in groups.values())]
     handles = [Line2D([], [], marker="o", linestyle="", color=colour(k), label=filters[k]) for k in drawn]
     figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False)
