@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from marcha.algorithms import foot_ukf, make
@@ -20,7 +22,7 @@ def test_prediction_equals_sampling(sigma_att: float) -> None:
     dt, n = 0.5, 400_000
     sd = np.array([1.0, 0.6, 0.8, 0.1, 0.2, 0.3, 0.05, 0.04, 0.03])
     sd[:3] *= sigma_att
-    estimator = make("foot.ukf", sigma_gyr=0.0, sigma_acc=0.0)
+    estimator: Any = make("foot.ukf", sigma_gyr=0.0, sigma_acc=0.0)
     state = estimator.state
     state[P : P + 81] = np.diag(sd**2).ravel()
     state[foot_ukf.FORCE : foot_ukf.FORCE + 3] = FORCE
