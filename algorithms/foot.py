@@ -65,7 +65,7 @@ from .rotations import quat_from_rot
 IMU_COLUMNS = ("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z")
 IMU = Input("sensor_msgs/msg/Imu", IMU_COLUMNS)
 MAGNETIC_FIELD = Input("sensor_msgs/msg/MagneticField", ("mag_x", "mag_y", "mag_z"), optional=True)
-FLUID_PRESSURE = Input("sensor_msgs/msg/FluidPressure", ("pressure",), optional=True)
+FLUID_PRESSURE = Input("sensor_msgs/msg/FluidPressure", ("pressure_pa",), optional=True)
 SOURCE_RATE_HZ = 100.0
 """Sample rate of the source's device, for a bare ``make()``; a different measured rate is remarked."""
 

@@ -134,6 +134,7 @@ def _step_back(a: FloatArray, at: int, stride: int, log: FloatArray) -> None:
             pushed += log[L_ROT_PRIOR + 3 * j + i] * a[vel + j * stride]
         a[bgyr + i * stride] -= dt * turned
         a[bacc + i * stride] -= dt * pushed
+    for i in range(3):
         a[vel + i * stride] += dt * a[pos + i * stride]
     a[att] += y * w - z * v
     a[att + stride] += z * u - x * w

@@ -56,10 +56,10 @@ def test_equals_the_textbook_recursion() -> None:
     found = columns(smoothed, "pose", *POSE), columns(smoothed, "velocity"), columns(smoothed, "sigma")
     filtered = out[:, :3], out[:, 7:10]
     for k in range(len(rows) - 1, first, -1):
-        np.testing.assert_allclose(found[0][k] - filtered[0][k], shift[6:9], atol=2e-6)
-        np.testing.assert_allclose(found[1][k] - filtered[1][k], shift[9:12], atol=2e-6)
+        np.testing.assert_allclose(found[0][k] - filtered[0][k], shift[6:9], atol=2e-8)
+        np.testing.assert_allclose(found[1][k] - filtered[1][k], shift[9:12], atol=2e-8)
         sigma = np.sqrt(np.diag(cov))[[6, 7, 8, 9, 10, 11, 0, 1, 2]]
-        np.testing.assert_allclose(found[2][k], sigma, atol=2e-6)
+        np.testing.assert_allclose(found[2][k], sigma, atol=2e-8)
         log, before = logs[k], logs[k - 1]
         p = before[f.L_P :].reshape(15, 15)
         dt = log[f.L_DT]
