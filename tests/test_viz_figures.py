@@ -14,7 +14,7 @@ import pytest
 from marcha.recording.errors import OutputExists, UsageError
 from marcha.viz import style
 from marcha.viz.plan import nice
-from marcha.viz.track import LIMIT, Track, compare, framed
+from marcha.viz.track import LIMIT, Track, compare, framed, reference_of
 
 from .test_viz_rrd import RUN, write_walk
 
@@ -134,6 +134,15 @@ def test_tracks_that_do_not_meet_in_time_are_not_compared() -> None:
     later = Track("r", "#000000")
     later.add(np.array([10**12, 10**12 + 10**6]), np.zeros((2, 3)))
     assert compare(line(50), later, "none") is None
+
+
+def test_a_run_is_compared_with_the_truth_of_its_own_sensor() -> None:
+    both = ["/reference/pose", "/reference/imu2/pose"]
+    assert reference_of("foot_9iez_foot_imu2", both) == "/reference/imu2/pose"
+    assert reference_of("foot_9iez_foot_imu2_2", both) == "/reference/imu2/pose"
+    assert reference_of("foot_9iez_foot_imu1", both) == "/reference/pose"
+    assert reference_of("foot_9iez_foot_imu", ["/reference/footprints"]) == "/reference/footprints"
+    assert reference_of("foot_9iez_foot_imu", []) is None
 
 
 def test_a_track_that_ran_away_does_not_set_the_frame() -> None:

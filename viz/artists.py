@@ -136,7 +136,7 @@ class Pose(Artist):
 
     def begin(self) -> None:
         # the channel named "pose" is its owner's track itself; others ("vicon") keep their name
-        self.base = self.parent if self.what == "pose" else self.path
+        self.base = self.scene.base(self.channel.topic)
         self.track = Track(self.owner, self.color)
         if self.scene.shows(self.owner):
             self.scene.tracks[self.base] = self.track

@@ -18,7 +18,7 @@ from ..recording import Recording
 from ..recording.atomic import AtomicFile
 from ..recording.errors import UsageError
 from . import style
-from .track import Compared, Track, compare, framed
+from .track import Compared, Track, compare, framed, reference_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -127,7 +127,7 @@ class _Scene:
 
     rec: Recording
     tracks: dict[str, Track]
-    reference: Track | None
+    references: dict[str, Track]
     compared: dict[str, Compared]
     alignment: str
 
@@ -137,7 +137,7 @@ class _Scene:
 
     @property
     def shown(self) -> list[Track]:
-        return [*([self.reference] if self.reference is not None else []), *self.tracks.values()]
+        return [*self.references.values(), *self.tracks.values()]
 
     @property
     def with_errors(self) -> bool:
@@ -156,24 +156,27 @@ def _scene(rec: Recording, alignment: str) -> _Scene:
     poses = [t for t, c in rec.channels.items() if c.schema == POSE]
     runs = [t for t in poses if t.startswith("/estimate/") and t.endswith("/pose")]
     references = [t for t in poses if t.startswith("/reference/")]
-    chosen = "/reference/pose" if "/reference/pose" in references else references[0] if references else None
+    truth = {t: reference_of(t.split("/")[2], references) for t in runs}
     found = {t: Track(t.split("/")[2], style.run_color(i)) for i, t in enumerate(runs)}
-    if chosen is not None:
-        found[chosen] = Track("reference", style.REFERENCE)
+    for topic in truth.values() if runs else [reference_of("", references)]:
+        if topic is not None:
+            found[topic] = Track(" ".join(topic.split("/")[1:-1]), style.REFERENCE)
     for window in rec.windows(list(found)) if found else ():
         for topic, table in window.tables.items():
             position = table.select("pos_x", "pos_y", "pos_z").to_numpy()
             turn = table.select([f"quat_{a}" for a in "wxyz"]).to_numpy() if "quat_w" in table else None
             found[topic].add(table["t_ns"].to_numpy(), position, turn)
-    tracks = {t.split("/")[2]: found[t] for t in runs if found[t].count}
-    reference = found[chosen] if chosen is not None and found[chosen].count else None
+    found = {t: track for t, track in found.items() if track.count}
     compared: dict[str, Compared] = {}
-    for run, track in tracks.items():
-        result = compare(track, reference, alignment) if reference is not None else None
-        if result is not None:
-            track.place, compared[run] = result.place, result
-            track.worst_m = result.worst_m
-    return _Scene(rec, tracks, reference, compared, alignment)
+    for topic, reference in truth.items():
+        if topic in found and reference in found:
+            track = found[topic]
+            result = compare(track, found[reference], alignment)
+            if result is not None:
+                track.place, track.worst_m, compared[track.owner] = result.place, result.worst_m, result
+    tracks = {found[t].owner: found[t] for t in runs if t in found}
+    seen = {t: track for t, track in found.items() if t in references}
+    return _Scene(rec, tracks, seen, compared, alignment)
 
 
 def _one(fig: Figure, scene: _Scene) -> None:
@@ -212,7 +215,7 @@ def _label(ax: Axes, title: str, y: str) -> None:
 
 def _line(track: Track, scene: _Scene) -> dict[str, Any]:
     """Return how a track's line looks: the reference lies wide and pale under the runs."""
-    if track is not scene.reference:
+    if track not in scene.references.values():
         return {"color": track.color, "linewidth": 1.4}
     return {"color": track.color, "linewidth": 3.0, "alpha": 0.6, "marker": "o" if track.sparse else ""}
 
@@ -266,7 +269,8 @@ def _signals(ax: Axes, scene: _Scene) -> None:
         t, norm = _thin(scene.seconds(table["t_ns"].to_numpy()), np.linalg.norm(acc, axis=1))
         ax.plot(t, norm, color=style.NORM if runs else style.run_color(i), linewidth=0.8, label=topic)
         high = max(high, float(np.nanmax(norm, initial=0.0)))
-    lanes = [("/reference/stance", style.REFERENCE)]
+    lanes = [(f"{t.rpartition('/')[0]}/stance", style.REFERENCE) for t in scene.references]
+    lanes = lanes or [("/reference/stance", style.REFERENCE)]
     lanes += [(_topic(run, "stance"), style.run_color(i)) for i, run in enumerate(runs)]
     lanes = [(topic, color) for topic, color in lanes if topic in rec.channels]
     height = 0.09 * max(high, 1.0)

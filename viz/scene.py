@@ -34,7 +34,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from . import style
-from .track import Track, compare
+from .track import Track, compare, reference_of
 
 if TYPE_CHECKING:
     from .artists import Artist
@@ -185,10 +185,15 @@ class Scene:
         self.last_ns: int | None = None
         self._origin: Floats | None = None
         channels = list(channels)
-        # beside the reference itself, those of single sensors ("/reference/imu2/pose") would only cover it
-        main = any(c.topic == "/reference/pose" for c in channels)
-        self._aside = {self.owner(c.topic) for c in channels if main and is_second_reference(c.topic)}
         self.runs = list(dict.fromkeys(c.topic.split("/")[2] for c in channels if is_estimate(c.topic)))
+        places = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PointStamped")
+        self.references = [
+            c.topic for c in channels if c.topic.startswith("/reference/") and c.schema in places
+        ]
+        # the truth of sensors that no run reads would only cover the one that matters
+        used = {reference_of(run, self.references) for run in self.runs or [""]}
+        wanted = {self.owner(t) for t in used if t is not None}
+        self._aside = {self.owner(t) for t in self.references} - wanted
         self.colors = {run: style.run_color(first_color + i) for i, run in enumerate(self.runs)}
         self.thresholds = sorted(
             {t for c in channels for t in thresholds_of(c)}, key=lambda t: (t.name, t.value)
@@ -200,6 +205,10 @@ class Scene:
     def group(self, topic: str) -> str:
         """Return the entity path of a channel: runs below ``/run``, everything else as its topic says."""
         return f"{self.prefix}/run/{topic[10:]}" if is_estimate(topic) else f"{self.prefix}{topic}"
+
+    def base(self, topic: str) -> str:
+        """Return the entity path of a pose channel's track: its owner's if it is called ``pose``."""
+        return self.group(topic).removesuffix("/pose")
 
     def color(self, topic: str) -> str:
         """Return the colour of a channel's owner: its run's, or the reference's."""
@@ -306,14 +315,11 @@ class Scene:
 
     def _compare(self) -> None:
         """Turn every run's track onto the reference and log its error over time."""
-        reference = self.tracks.get(f"{self.prefix}/reference") or next(
-            (t for g, t in self.tracks.items() if g.startswith(f"{self.prefix}/reference/") and t.count > 1),
-            None,
-        )
-        if reference is None:
-            return
         for path, track in self.tracks.items():
-            found = compare(track, reference, self.alignment) if "/run/" in path else None
+            _, mark, rest = path.partition("/run/")
+            topic = reference_of(rest.split("/")[0], self.references) if mark else None
+            reference = self.tracks.get(self.base(topic)) if topic is not None else None
+            found = compare(track, reference, self.alignment) if reference is not None else None
             if found is None:
                 continue
             track.place, track.worst_m = found.place, found.worst_m
@@ -339,11 +345,6 @@ class Scene:
 def is_estimate(topic: str) -> bool:
     """Return whether a topic is a run's output, ``/estimate/<run>/<what>``."""
     return topic.startswith("/estimate/") and topic.count("/") >= 3
-
-
-def is_second_reference(topic: str) -> bool:
-    """Return whether a topic is the truth of one sensor among several, ``/reference/<sensor>/<what>``."""
-    return topic.startswith("/reference/") and topic.count("/") > 2
 
 
 def thresholds_of(channel: ChannelLike) -> Iterator[Threshold]:

@@ -124,6 +124,23 @@ def framed(tracks: Sequence[Track]) -> list[Track]:
     return near or list(tracks)
 
 
+def reference_of(run: str, references: Sequence[str]) -> str | None:
+    """Return the topic of a run's truth, as the evaluation does: that of its own sensor, else the common one.
+
+    Parameters
+    ----------
+    run : str
+        Id of the run, which ends with the parts of its input's topic (``foot_9iez_foot_imu2``).
+    references : sequence of str
+        Topics of poses (``/reference/pose``, ``/reference/imu2/pose``, ``/reference/footprints``).
+    """
+    sensors = {t: "_".join(t.split("/")[2:-1]) for t in references}
+    own = [t for t, sensor in sensors.items() if sensor and f"_{sensor}_" in f"_{run}_"]
+    if own:
+        return max(own, key=len)
+    return "/reference/pose" if "/reference/pose" in references else next(iter(references), None)
+
+
 @dataclass(frozen=True)
 class Compared:
     """A track laid upon a reference.
