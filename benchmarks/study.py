@@ -40,7 +40,8 @@ def _measure(workers: int, walks: int, folder: Path) -> float:
     """Return the seconds of a whole study; one process means one core, so libraries get one thread."""
     from marcha.replay.study.executors import SINGLE_THREAD
 
-    command = [sys.executable, "-W", "ignore", "-m", "benchmarks.study", str(workers), str(walks), str(folder)]
+    arguments = [str(workers), str(walks), str(folder)]
+    command = [sys.executable, "-W", "ignore", "-m", "benchmarks.study", *arguments]
     done = subprocess.run(
         command,
         env=os.environ | SINGLE_THREAD,

@@ -81,6 +81,13 @@ def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figures, "drawings", lambda *_: [])
 
 
+@pytest.fixture
+def two_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draw as few figures as show that the processes draw them."""
+    every = figures.drawings
+    monkeypatch.setattr(figures, "drawings", lambda *a: every(*a)[:2])
+
+
 @pytest.fixture(scope="module")
 def finished(fixed_code: None, tmp_path_factory: pytest.TempPathFactory) -> StudyResult:
     return run_study(config(), tmp_path_factory.mktemp("study") / "out", workers=1, **MAKERS)
@@ -334,6 +341,7 @@ def test_a_raw_study_without_importers_says_what_to_pass(tmp_path: Path) -> None
     assert "pass simulate=" in result.notes[0]
 
 
+@pytest.mark.usefixtures("two_figures")
 def test_two_processes_give_the_same_results(finished: StudyResult, tmp_path: Path) -> None:
     result = run_study(config(), tmp_path / "out", workers=2, **MAKERS)
     assert same_apart_from_times(result.results, finished.results)

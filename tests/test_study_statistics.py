@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from marcha.replay.study.statistics import (
     corrected,
     hedges_g,
     holm,
+    normal_quantiles,
     outlier_mask,
     summarize,
 )
@@ -128,3 +130,11 @@ def test_a_comparison_turned_round_changes_signs_only(n: int, k: int, shift: flo
     assert (one.hedges_g, one.hedges_low) == pytest.approx(
         (-other.hedges_g, -other.hedges_high), rel=1e-4, abs=1e-6
     )
+
+
+@pytest.mark.parametrize("count", [3, 30])
+def test_normal_quantiles_are_scipys(count: int) -> None:
+    from scipy import stats
+
+    expected: Any = stats.probplot(np.arange(float(count)), fit=False)
+    assert normal_quantiles(count) == pytest.approx(expected[0], rel=1e-12, abs=1e-12)

@@ -24,6 +24,7 @@ from .analysis import order
 from .cells import Cell
 from .executors import Executor
 from .report import Material, Picture
+from .statistics import normal_quantiles
 
 #: Okabe and Ito (2008): told apart with every kind of colour vision.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#F0E442")
@@ -158,8 +159,6 @@ def qq(frame: pl.DataFrame, config: cfg.StudyConfig) -> Figure | None:
 
     Values are standardized with their group's mean and standard deviation, so that all filters fit one panel.
     """
-    from scipy import stats
-
     levels = order(frame, config)
     filters = levels["filter"]
     good = frame.filter(~pl.col("outlier") & pl.col("value").is_finite())
@@ -180,9 +179,10 @@ def qq(frame: pl.DataFrame, config: cfg.StudyConfig) -> Figure | None:
     for ax, (configuration, samples) in zip(axes, groups.items(), strict=False):
         reach = 2.0
         for name, values in samples.items():
-            fit: Any = stats.probplot((values - values.mean()) / values.std(ddof=1), fit=False)
-            ax.plot(*fit, ".", color=colour(filters.index(name)), markersize=5)
-            reach = max(reach, float(fit[0][-1]))
+            quantiles = normal_quantiles(len(values))
+            standardized = np.sort((values - values.mean()) / values.std(ddof=1))
+            ax.plot(quantiles, standardized, ".", color=colour(filters.index(name)), markersize=5)
+            reach = max(reach, float(quantiles[-1]))
         ax.plot([-reach, reach], [-reach, reach], color="black", linewidth=0.9)
         ax.set_title(configuration)
     for ax in axes[len(groups) :]:

@@ -234,3 +234,13 @@ def corrected(family: Sequence[Comparison]) -> list[Comparison]:
         msgspec.structs.replace(c, welch_p_holm=float(w), rank_p_holm=float(r))
         for c, w, r in zip(family, welch, rank, strict=True)
     ]
+
+
+def normal_quantiles(count: int) -> NDArray[np.float64]:
+    """Return the quantiles of ``count`` ordered normal values (Filliben 1975), the axis of a Q-Q plot."""
+    from scipy.special import ndtri
+
+    share = (np.arange(1, count + 1) - 0.3175) / (count + 0.365)
+    share[-1] = 0.5 ** (1 / count)
+    share[0] = 1 - share[-1]
+    return ndtri(share)
