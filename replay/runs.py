@@ -50,7 +50,7 @@ class Runner:
         self.estimator: Any = plan.estimator
         self.columns = output_columns(plan.estimator)
         self.latency = plan.latency
-        self.blocks = blocks and hasattr(self.estimator, "run_block")
+        self.blocks = blocks and not plan.offline and hasattr(self.estimator, "run_block")
         self.loop_s = 0.0
         self._stance: list[tuple[int, int]] = []
         self._steps: list[tuple[int, int, dict[str, str]]] = []
@@ -65,9 +65,13 @@ class Runner:
         if self.blocks:
             self.estimator.run_block(np.empty((0, width)), np.empty((0, len(self.columns))))
         elif isinstance(self.estimator, KernelEstimator):
-            before = self.estimator.snapshot()
-            self.estimator.step(np.zeros(width))
-            self.estimator.restore(before)
+            estimator: Any = self.estimator
+            before = estimator.snapshot()
+            if self.plan.offline:
+                estimator.process(np.zeros((2, width)))
+            else:
+                estimator.step(np.zeros(width))
+            estimator.restore(before)
 
     # -- state ---------------------------------------------------------------------------------------
 
