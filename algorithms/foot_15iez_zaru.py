@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 
 from numba import njit
 
-from . import foot, kalman, strapdown
+from . import aiding, foot, kalman, strapdown
 from . import foot_9iez as base
 from . import layout as la
 from .contract import FloatArray
@@ -19,7 +19,7 @@ from .rotations import orthonormalize, turn_nav
 N = 15
 ATT, BGYR, XPOS, XVEL, BACC = 0, 3, 6, 9, 12
 
-_take = la.Allocator(la.CORE)
+_take = la.Allocator(aiding.SIZE)
 Q_GYR = _take()
 Q_ACC = _take()
 Q_GYR_WALK = _take()
@@ -65,6 +65,9 @@ class Foot15IezZaruParams(base.Foot9IezParams, frozen=True, forbid_unknown_field
     ] = 0.05
 
 
+Foot15IezZaruAidedParams = aiding.with_aids(Foot15IezZaruParams, "Foot15IezZaruAidedParams", __name__)
+
+
 @njit(cache=True, nogil=True)
 def predict(s: FloatArray, dt: float) -> None:
     """Carry P over one time step: F P Fᵀ + Q (eqs 3.34–3.37 with the bias columns of 3.43)."""
@@ -89,6 +92,12 @@ def correct(s: FloatArray, r: int) -> None:
             # Measured rate = true bias at rest, so the bias estimate's error is seen directly.
             seen = s[BIAS_GYR + i] - s[r + R_GYR + i]
             kalman.update(s, P, N, DX, WORK, BGYR + i, seen, s[R_ZARU], 0)
+    feed_back(s)
+
+
+@njit(cache=True, nogil=True)
+def feed_back(s: FloatArray) -> None:
+    """Take the errors in ``DX`` out of position, velocity, biases and attitude."""
     for i in range(3):
         s[POS + i] -= s[DX + XPOS + i]
         s[VEL + i] -= s[DX + XVEL + i]
@@ -106,6 +115,8 @@ def _navigate(s: FloatArray, out: FloatArray) -> None:
         predict(s, s[r + R_DT])
         if s[r + R_STILL] > 0.5:
             correct(s, r)
+    if s[aiding.ON] > 0.5 and aiding.aid(s, r, P, N, ATT, XPOS, DX, WORK):
+        feed_back(s)
     foot.emit(s, r, out)
     foot.emit_sigma(s, P, N, XPOS, XVEL, ATT, out)
     foot.emit_detector(s, r, base.FIRST_DETECTOR, out)
@@ -142,7 +153,7 @@ def flush(state: FloatArray, out: FloatArray) -> int:
     return results
 
 
-class Foot15IezZaru(foot.FootEstimator):
+class Foot15IezZaru(aiding.AidedEstimator):
     """Error-state Kalman filter with fifteen states, zero-velocity and zero-angular-rate updates.
 
     Source: foot-navigation dissertation, eqs 3.43–3.44. δx = [δφ, δω_b, δp, δv, δa_b], error = estimate −
@@ -152,13 +163,13 @@ class Foot15IezZaru(foot.FootEstimator):
     Departures: the source updates the bias in every stance; here the zero angular rate needs a rest of its
     own (``zaru_after_s``, ``zaru_gyr_max``), because a walking foot turns by 0.1–0.5 rad/s while it counts
     as still. The prior of the gyroscope bias is what the rest leaves open (2e-4 rad/s); a loose one ruins
-    the walk.
+    the walk. The aids of :mod:`.aiding` are ours and off by default.
     """
 
     name: ClassVar[str] = "foot.15iez-zaru"
     title: ClassVar[str] = "error-state Kalman filter, 15 states, zero-velocity and zero-angular-rate updates"
     source: ClassVar[str] = "foot-navigation dissertation, eqs 3.43–3.44"
-    Params = Foot15IezZaruParams
+    Params = Foot15IezZaruAidedParams
     state_size: ClassVar[int] = SIZE
     kernel = staticmethod(kernel)
     run = staticmethod(run)

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar
 
 from numba import njit
 
-from . import foot, kalman, strapdown
+from . import aiding, foot, kalman, strapdown
 from . import layout as la
 from .contract import FloatArray
 from .layout import ACC_N, POS, R_DT, R_STILL, ROT, STARTED, VEL
@@ -16,7 +16,7 @@ from .rotations import orthonormalize, turn_nav
 N = 9
 ATT, XPOS, XVEL = 0, 3, 6
 
-_take = la.Allocator(la.CORE)
+_take = la.Allocator(aiding.SIZE)
 Q_GYR = _take()  # σ_ω², per unit of Δt²
 Q_ACC = _take()
 R_VEL = _take()
@@ -49,6 +49,9 @@ class Foot9IezParams(foot.FootParams, frozen=True, forbid_unknown_fields=True, k
     ] = 0.01
 
 
+Foot9IezAidedParams = aiding.with_aids(Foot9IezParams, "Foot9IezAidedParams", __name__)
+
+
 @njit(cache=True, nogil=True)
 def predict(s: FloatArray, dt: float) -> None:
     """Carry P over one time step: F P Fᵀ + Q with f_n in ``ACC_N`` (eqs 3.34–3.37)."""
@@ -64,6 +67,12 @@ def zero_velocity(s: FloatArray, considered: int) -> None:
     kalman.clear(s, DX, N)
     for i in range(3):
         kalman.update(s, P, N, DX, WORK, XVEL + i, s[VEL + i], s[R_VEL], considered)
+    feed_back(s, considered)
+
+
+@njit(cache=True, nogil=True)
+def feed_back(s: FloatArray, considered: int) -> None:
+    """Take the errors in ``DX`` out of position, velocity and, unless it is considered, attitude."""
     for i in range(3):
         s[POS + i] -= s[DX + XPOS + i]
         s[VEL + i] -= s[DX + XVEL + i]
@@ -80,6 +89,8 @@ def _navigate(s: FloatArray, out: FloatArray) -> None:
         predict(s, s[r + R_DT])
         if s[r + R_STILL] > 0.5:
             zero_velocity(s, 0)
+    if s[aiding.ON] > 0.5 and aiding.aid(s, r, P, N, ATT, XPOS, DX, WORK):
+        feed_back(s, 0)
     foot.emit(s, r, out)
     foot.emit_sigma(s, P, N, XPOS, XVEL, ATT, out)
     foot.emit_detector(s, r, FIRST_DETECTOR, out)
@@ -123,20 +134,21 @@ def configure(state: FloatArray, params: Any) -> None:
     state[R_VEL] = params.sigma_zupt**2
 
 
-class Foot9Iez(foot.FootEstimator):
+class Foot9Iez(aiding.AidedEstimator):
     """Error-state Kalman filter with nine states (attitude, position, velocity) and zero-velocity updates.
 
     Source: foot-navigation dissertation, eqs 3.28–3.42 (after Jiménez et al. 2010). F = [[I, 0, 0], [0, I,
     IΔt], [−[f_n]×Δt, 0, I]], Q = diag(σ_ω², 0, σ_a²)Δt², P0 = 0, H = [0 0 I], R = σ_v².
 
     Departures: the signs before R in (3.36) and Q in (3.37) and the Δt in (3.41) are taken for misprints;
-    Joseph form, the three velocities one after another (equal to all at once).
+    Joseph form, the three velocities one after another (equal to all at once). The aids of :mod:`.aiding`
+    (flat ground, straight walking, magnetometer, barometer) are ours and off by default.
     """
 
     name: ClassVar[str] = "foot.9iez"
     title: ClassVar[str] = "error-state Kalman filter, 9 states, zero-velocity updates"
     source: ClassVar[str] = "foot-navigation dissertation, eqs 3.28–3.42"
-    Params = Foot9IezParams
+    Params = Foot9IezAidedParams
     state_size: ClassVar[int] = SIZE
     kernel = staticmethod(kernel)
     run = staticmethod(run)
