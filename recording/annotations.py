@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
 import polars as pl
 
 from .cdr import CdrError, decode, encode
@@ -105,10 +105,12 @@ def encode_events(rows: pl.DataFrame, channel_id: int) -> Iterator[tuple[int, by
             message = encode(value, definition, library)
         except CdrError as e:
             raise MarchaError(f"annotations: {label!r} at {start} ns: {e}") from None
-        head = np.zeros((), PREFIX)
-        head["opcode"], head["length"], head["channel"] = 5, len(message) + PREFIX.itemsize - 9, channel_id
-        head["sequence"], head["log"], head["publish"] = i, start, start
-        yield start, head.tobytes() + message
+        size = len(message) + PREFIX.itemsize - 9
+        yield start, _PREFIX.pack(5, size, channel_id, i, start, start) + message
+
+
+_PREFIX = struct.Struct("<BQHIQQ")
+"""``codec.PREFIX`` for one record."""
 
 
 class EventDecoder:

@@ -245,52 +245,44 @@ def encode(value: Mapping[str, Any], definition: Definition, library: Library) -
     CdrError
         A field is missing, unknown, or of the wrong length.
     """
-    leaves: dict[str, Any] = {}
-    lengths: dict[str, int] = {}
-    _flatten("", value, definition, library, leaves, lengths)
-    layout = layout_of_lengths(definition, library, lengths)
-    record = layout.template()
-    for path, leaf in leaves.items():
-        try:
-            record[path] = leaf
-        except (OverflowError, ValueError, TypeError) as e:
-            raise CdrError(f"{definition.name}: {path}: {e}") from None
-    return record.tobytes()
+    out = bytearray(b"\x00\x01\x00\x00")
+    _write(out, "", value, definition, library)
+    return bytes(out)
 
 
-def _flatten(
-    prefix: str,
-    value: Mapping[str, Any],
-    definition: Definition,
-    library: Library,
-    leaves: dict[str, Any],
-    lengths: dict[str, int],
+def _write(
+    out: bytearray, prefix: str, value: Mapping[str, Any], definition: Definition, library: Library
 ) -> None:
-    names = {f.name for f in definition.fields}
-    if set(value) != names:
-        odd = sorted(names ^ set(value))
+    """Append the fields of one message; alignment counts from byte 4."""
+    if value.keys() != definition.names:
+        odd = sorted(definition.names ^ value.keys())
         raise CdrError(f"{definition.name}: fields missing or unknown: {', '.join(odd)}")
     for field in definition.fields:
         path, item = prefix + field.name, value[field.name]
-        if field.length is not None:
-            if field.length == -1:
-                lengths[path] = len(item)
-            elif len(item) != field.length:
-                raise CdrError(f"{definition.name}: {path}: {len(item)} elements, {field.length} expected")
-        if field.type in PRIMITIVES:
+        if field.length == -1:
+            out += bytes(-len(out) % 4) + len(item).to_bytes(4, "little")
+        elif field.length is not None and len(item) != field.length:
+            raise CdrError(f"{definition.name}: {path}: {len(item)} elements, {field.length} expected")
+        primitive = PRIMITIVES.get(field.type)
+        if primitive is not None:
             if field.length is None or len(item):
-                leaves[path] = item
+                try:
+                    raw = np.array(item, "<" + primitive)
+                except (OverflowError, ValueError, TypeError) as e:
+                    raise CdrError(f"{definition.name}: {path}: {e}") from None
+                if raw.shape != (() if field.length is None else (len(item),)):
+                    raise CdrError(f"{definition.name}: {path}: shape {raw.shape}")
+                out += bytes(-(len(out) - 4) % raw.itemsize) + raw.tobytes()
             continue
-        items = {path: item} if field.length is None else {f"{path}[{i}]": v for i, v in enumerate(item)}
-        for p, v in items.items():
+        for i, v in enumerate([item] if field.length is None else item):
             if field.type == "string":
-                raw = str(v).encode()
-                if b"\x00" in raw:
-                    raise CdrError(f"{definition.name}: {p}: a string may not contain NUL")
-                lengths[p] = len(raw)
-                leaves[p] = raw
+                text = str(v).encode()
+                if b"\x00" in text:
+                    raise CdrError(f"{definition.name}: {path}: a string may not contain NUL")
+                out += bytes(-len(out) % 4) + (len(text) + 1).to_bytes(4, "little") + text + b"\x00"
             else:
-                _flatten(p + ".", v, library[field.type], library, leaves, lengths)
+                inner = f"{path}." if field.length is None else f"{path}[{i}]."
+                _write(out, inner, v, library[field.type], library)
 
 
 def decode(message: bytes | memoryview, definition: Definition, library: Library) -> dict[str, Any]:

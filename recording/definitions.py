@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib import resources
 
 from .errors import MarchaError
@@ -75,6 +75,11 @@ class Definition:
     name: str
     fields: tuple[Field, ...]
     constants: Mapping[str, str]
+
+    @cached_property
+    def names(self) -> frozenset[str]:
+        """Names of the fields."""
+        return frozenset(f.name for f in self.fields)
 
 
 Library = Mapping[str, Definition]
