@@ -129,8 +129,8 @@ class AidingParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     ] = False
     hupt_max_m: Annotated[
         float,
-        meta("Height update: greatest change of height on flat ground", "m", "ours: half a stair", gt=0.0),
-    ] = 0.08
+        meta("Height update: greatest change of height on flat ground", "m", "ours: below the lowest stairs", gt=0.0),
+    ] = 0.1
     sigma_hupt: Annotated[float, meta("Height update: noise of the level's height", "m", "ours", gt=0.0)] = (
         0.01
     )
@@ -177,7 +177,7 @@ class AidingParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     magnetometer: Annotated[
         bool, meta("Heading from the magnetometer, relative to the start", source="ours")
     ] = False
-    sigma_mag_yaw: Annotated[float, meta("Magnetometer: noise of the heading", "rad", "ours", gt=0.0)] = 0.1
+    sigma_mag_yaw: Annotated[float, meta("Magnetometer: noise of the heading", "rad", "ours", gt=0.0)] = 0.05
     mag_norm_max: Annotated[
         float,
         meta(
@@ -518,7 +518,7 @@ class AidedEstimator(foot.FootEstimator):
             found.append(
                 Remark(
                     "aid_unused",
-                    f"heading_aid is on but did nothing: no {p.straight_strides} strides in a row went straight",
+                    f"heading_aid is on but did nothing: never {p.straight_strides} straight strides in a row",
                 )
             )
         return found
