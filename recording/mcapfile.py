@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import threading
 import zlib
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -222,6 +223,18 @@ class McapFile:
         self._at += len(data)
 
 
+_local = threading.local()
+
+
+def _compressor(level: int) -> zstandard.ZstdCompressor:
+    """Return this thread's compressor; a new one for every chunk would allocate its tables anew."""
+    key, compressor = getattr(_local, "zstd", (None, None))
+    if compressor is None or key != level:
+        compressor = zstandard.ZstdCompressor(level=level)
+        _local.zstd = level, compressor
+    return compressor
+
+
 def pack(
     data: Bytes,
     channel_id: int,
@@ -243,7 +256,7 @@ def pack(
         Compression level of zstd.
     """
     raw = data.data
-    compressed = zstandard.ZstdCompressor(level=level).compress(raw)
+    compressed = _compressor(level).compress(raw)
     first, last = int(log.min()), int(log.max())
     chunk = RecordBuilder()
     Chunk("zstd", compressed, last, first, zlib.crc32(raw), data.size).write(chunk)

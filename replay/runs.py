@@ -57,6 +57,7 @@ class Runner:
         self._state = _State()
         self._compile()
         self._fresh = self._estimator_snapshot()
+        self._out = np.empty((0, len(self.columns)))
         self._rows: list[tuple[FloatArray, IntArray]] = []  # of an offline estimator, the present segment
 
     def _compile(self) -> None:
@@ -140,7 +141,10 @@ class Runner:
         if self.plan.offline:
             self._rows.append((values, t_ns))
             return {}
-        out = np.full((len(t_ns), len(self.columns)), np.nan)
+        if len(self._out) < len(t_ns):
+            self._out = np.empty((len(t_ns), len(self.columns)))
+        out = self._out[: len(t_ns)]  # fresh memory for every block would cost as much as the estimator
+        out.fill(np.nan)
         begin = time.perf_counter()
         if self.blocks:
             self.estimator.run_block(values, out)
@@ -192,12 +196,14 @@ class Runner:
 
     def _tables(self, out: FloatArray, t_ns: IntArray, t_log_ns: IntArray) -> dict[str, pl.DataFrame]:
         tables: dict[str, pl.DataFrame] = {}
-        columns = np.ascontiguousarray(out.T)
+        columns = out.T.copy()  # the block's memory is used again
         first = 0
         for output in self.estimator.outputs:
             block = columns[first : first + len(output.columns)]
             first += len(output.columns)
-            spoken = ~np.isnan(block[0]) if output.event else ~np.isnan(block).all(axis=0)
+            spoken = ~np.isnan(block[0])
+            if not output.event and not spoken.all():
+                spoken = ~np.isnan(block).all(axis=0)
             if not spoken.any():
                 continue
             all_of_it = bool(spoken.all())

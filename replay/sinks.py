@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from .engine import ReplayResult
 
 
-LEVEL = 1
-"""Compression of estimates: their low bits are noise, level 3 takes 2.5 times as long for the same size."""
+LEVEL = -3
+"""Compression of estimates: their low bits are noise. Level 1 takes twice as long for files 7 % smaller, level 3
+four times as long for 8 %."""
 
 
 class Sink(Protocol):
