@@ -9,7 +9,7 @@ demo: $(VENV)/.stamp
 	$(BIN)/marcha demo -o demo --force $(if $(SHOW),--show)
 
 test: $(VENV)/.stamp-dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto
 
 lint: $(VENV)/.stamp-dev
 	$(BIN)/ruff check .
