@@ -129,7 +129,7 @@ class AidingParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     ] = False
     hupt_max_m: Annotated[
         float,
-        meta("Height update: greatest change of height on flat ground", "m", "ours: below the lowest stairs", gt=0.0),
+        meta("Height update: greatest change of height on flat ground", "m", "ours: below a stair", gt=0.0),
     ] = 0.1
     sigma_hupt: Annotated[float, meta("Height update: noise of the level's height", "m", "ours", gt=0.0)] = (
         0.01
@@ -488,8 +488,8 @@ class AidedEstimator(foot.FootEstimator):
 
     def remarks(self) -> list[Remark]:
         """Return the common remarks, and every aid that is on but did nothing."""
-        s, p = self.state, self.params
-        found = super().remarks()
+        s, found = self.state, super().remarks()
+        p: Any = self.params
         if s[ON] < 0.5 or s[STARTED] < 0.5:
             return found
         for name, seen, used, kind in (
@@ -518,7 +518,7 @@ class AidedEstimator(foot.FootEstimator):
             found.append(
                 Remark(
                     "aid_unused",
-                    f"heading_aid is on but did nothing: never {p.straight_strides} straight strides in a row",
+                    f"heading_aid is on but did nothing: never {p.straight_strides} strides straight on",
                 )
             )
         return found
