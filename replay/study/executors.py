@@ -137,8 +137,12 @@ def _start_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
+#: What workers need: imported once, by the server that they are forked from.
+PRELOAD = ["marcha.replay.study.cells", "marcha.replay.study.figures", "marcha.ingest.simulate"]
+
+
 def _ready() -> None:
-    """Make a worker import what the tasks need before there is one for it."""
+    """Make a worker start, and import what the tasks need, before there is one for it."""
     from . import cells  # noqa: F401
 
 
@@ -159,9 +163,13 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
 def _start(count: int) -> ProcessPoolExecutor:
     import multiprocessing
 
-    # spawn: threads of polars and numba do not survive a fork, and it is the same on every system.
-    pool = ProcessPoolExecutor(count, multiprocessing.get_context("spawn"), initializer=_start_worker)
-    with _environment(SINGLE_THREAD):  # read when a worker starts, which submit does
+    # Not fork: threads of polars and numba do not survive it. A fork server has none of them; it imports
+    # once what all workers need, where the system has it.
+    methods = multiprocessing.get_all_start_methods()
+    context = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
+    context.set_forkserver_preload(PRELOAD)
+    pool = ProcessPoolExecutor(count, context, initializer=_start_worker)
+    with _environment(SINGLE_THREAD):  # read when the server or a worker starts, which submit does
         for _ in range(count):
             pool.submit(_ready)
     return pool

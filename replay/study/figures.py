@@ -14,10 +14,13 @@ import msgspec
 import numpy as np
 import polars as pl
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import LogFormatter
 
 from . import config as cfg
 from .analysis import order
@@ -32,6 +35,9 @@ GREY = "#666666"
 
 #: Quartiles of fewer values say nothing: those groups are drawn as points.
 BOX_LEAST = 5
+
+#: Dots per inch of the PNG.
+DPI = 120
 
 #: matplotlib's settings for all figures; text stays text in SVG.
 STYLE: Any = {
@@ -99,10 +105,17 @@ def _axis_label(frame: pl.DataFrame) -> str:
     return f"{metric} ({unit})" if unit else metric
 
 
+def _log_scale(ax: Axes) -> None:
+    """Make the vertical axis logarithmic, with plain numbers (powers of ten are typeset, which is slow)."""
+    ax.set_yscale("log")
+    ax.yaxis.set_major_formatter(LogFormatter())
+    ax.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.7)))
+
+
 def _scale(ax: Axes, frame: pl.DataFrame, log: bool) -> None:
     values = frame.filter(~pl.col("outlier") & pl.col("value").is_finite())["value"]
     if log and len(values) and float(values.min()) > 0:  # pyright: ignore[reportArgumentType]
-        ax.set_yscale("log")
+        _log_scale(ax)
     elif len(values) and float(values.min()) >= 0:  # pyright: ignore[reportArgumentType]
         ax.set_ylim(bottom=0)
 
@@ -269,7 +282,7 @@ def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> Figure:
             ax.plot(x, row["mean"], "o", color=colour(k), markersize=7)
         ax.set_xticks(range(len(configurations)), configurations)
         ax.set_xlim(-0.5, len(configurations) - 0.5)
-        ax.set_yscale("log")
+        _log_scale(ax)
         ax.set(title=metric, xlabel="configuration", ylabel="mean NEES (1)")
     handles = [
         Line2D([], [], marker="o", linestyle="", color=colour(k), label=f) for k, f in enumerate(filters)
@@ -353,13 +366,15 @@ def render_drawing(drawing: Drawing) -> Picture | None:
         figure = drawing.function(*drawing.arguments)
         if figure is None:
             return None
+        figure.set_dpi(DPI)
         engine = figure.get_layout_engine()
         if engine is not None:  # laid out once for both formats
             engine.execute(figure)
         figure.set_layout_engine("none")
         png, svg = io.BytesIO(), io.BytesIO()
-        figure.savefig(png, format="png", dpi=120)
-        figure.savefig(svg, format="svg", metadata={"Date": None})
+        # Not savefig: it draws everything twice.
+        FigureCanvasAgg(figure).print_png(png)
+        FigureCanvasSVG(figure).print_svg(svg, metadata={"Date": None})
     return Picture(drawing.name, drawing.section, drawing.caption, png.getvalue(), svg.getvalue())
 
 
