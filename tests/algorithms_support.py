@@ -9,7 +9,7 @@ import numpy as np
 from marcha.algorithms import make, output_columns
 from marcha.ingest import simulate as sim
 
-FOOT = ("foot.naive", "foot.9iez", "foot.9iez-mad", "foot.9iez-kf", "foot.15iez-zaru")
+FOOT = ("foot.naive", "foot.9iez", "foot.9iez-mad", "foot.9iez-kf", "foot.15iez-zaru", "foot.ukf")
 
 
 def rows_of(t: np.ndarray, acc: np.ndarray, gyr: np.ndarray) -> np.ndarray:

@@ -55,6 +55,10 @@ class Test15IezZaru(FootContract):
     name = "foot.15iez-zaru"
 
 
+class TestUkf(FootContract):
+    name = "foot.ukf"
+
+
 INTERPRETED = """
 import sys
 import numpy as np
