@@ -33,15 +33,16 @@ COMMANDS: tuple[tuple[Group, str, str, str], ...] = (
     (RAW, "convert", "convert:convert", "Turn raw logs into recordings and report every defect."),
     (WORK, "info", "contents:info", "Show what a recording holds."),
     (WORK, "check", "contents:check", "Look for what is wrong with a recording."),
-    (WORK, "estimators", "available:estimators", "List the estimators with their parameters."),
+    (WORK, "estimators", "available:estimators", "List the estimators, and the parameters of those named."),
     (WORK, "replay", "replay:replay", "Feed a recording to estimators as if it were live."),
     (WORK, "evaluate", "replay:evaluate", "Measure the estimates of a replayed recording."),
+    (WORK, "tune", "tune:tune", "Search the thresholds that fit walks of known length best."),
     (WORK, "study", "study:study", "Compare estimators over many recordings, with statistics."),
     (HAND, "view", "view:view", "Show recordings on one time line in the Rerun viewer."),
     (HAND, "annotate", "annotate:app", "Add, import or list labelled intervals of a recording."),
     (HAND, "export", "export:export", "Write a recording, or part of it, in another tool's format."),
     (HAND, "demo", "demo:demo", "Simulate, convert, replay, evaluate and export three walks."),
-    (MORE, "completion", "completion:completion", "Install completion for your shell, or print its script."),
+    (MORE, "completion", "completion:completion", "Print the script that completes commands in your shell, or install it."),
 )
 """Group, name, where it is, and the first line of its docstring: known without importing the command."""
 

@@ -10,6 +10,7 @@ from .metrics import RunView, Truth, nees_bounds
 from .plan import EstimatorSpec, Plan, PlannedRun, parse_estimator, plan_runs
 from .sinks import RecordingSink, Sink, TableSink
 from .sources import Batch, LiveSource, PlannedChannel, RecordingSource, Source, SourceFailed
+from .tuning import Tuned, tune
 
 __all__ = [
     "ALIGNMENTS",
@@ -36,6 +37,7 @@ __all__ = [
     "SystemClock",
     "TableSink",
     "Truth",
+    "Tuned",
     "align",
     "check_thresholds",
     "evaluate",
@@ -43,4 +45,5 @@ __all__ = [
     "parse_estimator",
     "plan_runs",
     "replay",
+    "tune",
 ]
