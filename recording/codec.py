@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -155,6 +156,7 @@ class Encoder:
             constants = group.present if group in groups else group.absent
             self._constants |= {self._root + k: v for k, v in constants.items()}
         self._text_bindings = [b for b in self.bindings if b.kind == "text"]
+        self._local = threading.local()
         self._cache: dict[tuple[bytes, ...], tuple[np.dtype[Any], Bytes]] = {}
         self.record_size = self._plan(tuple(b"" for _ in self._text_bindings))[1].size
 
@@ -205,13 +207,14 @@ class Encoder:
         Returns
         -------
         data : ndarray of uint8
-            The records, one behind the other.
+            The records, one behind the other; valid until this thread's next call.
         offsets : ndarray of int64, shape (n,)
             Where each record starts in ``data``.
         """
         n = len(t_ns)
         if not self._text_bindings:
-            data = self._encode((), columns, t_ns, t_log_ns, np.arange(sequence, sequence + n))
+            data = self._blank_records(n)
+            self._fill(data, self._plan(())[0], columns, t_ns, t_log_ns, np.arange(sequence, sequence + n))
             return data.reshape(-1), np.arange(n, dtype=np.int64) * data.shape[1]
         texts = list(zip(*(columns[b.column] for b in self._text_bindings), strict=True))
         records: list[bytes] = [b""] * n
@@ -221,24 +224,31 @@ class Encoder:
             rows_of.setdefault(text, []).append(i)
         for text, rows in rows_of.items():
             part = {k: v[rows] for k, v in columns.items()}
-            for i, row in zip(
-                rows, self._encode(text, part, t_ns[rows], t_log_ns[rows], numbers[rows]), strict=True
-            ):
+            dtype, template = self._plan(text)
+            data = np.tile(template, (len(rows), 1))
+            self._fill(data, dtype, part, t_ns[rows], t_log_ns[rows], numbers[rows])
+            for i, row in zip(rows, data, strict=True):
                 records[i] = row.tobytes()
         sizes = np.fromiter(map(len, records), np.int64, n)
         return np.frombuffer(b"".join(records), "u1"), np.cumsum(sizes) - sizes
 
-    def _encode(
+    def _blank_records(self, n: int) -> Bytes:
+        """Return ``n`` records with all that is constant in them, in memory that this thread uses again."""
+        data = getattr(self._local, "data", None)
+        if data is None or len(data) < n:
+            data = self._local.data = np.tile(self._plan(())[1], (n, 1))
+        return data[:n]
+
+    def _fill(
         self,
-        texts: tuple[bytes, ...],
+        data: Bytes,
+        dtype: np.dtype[Any],
         columns: Mapping[str, NDArray[Any]],
         t_ns: NDArray[np.int64],
         t_log_ns: NDArray[np.int64],
         sequence: NDArray[np.int64],
-    ) -> Bytes:
-        dtype, template = self._plan(texts)
-        data = np.empty((len(t_ns), template.size), "u1")
-        data[:] = template
+    ) -> None:
+        """Write the numbers of a block of rows into their records."""
         records = data.view(dtype)[:, 0]
         records["@sequence"] = sequence & 0xFFFFFFFF
         records["@log"] = t_log_ns
@@ -252,7 +262,6 @@ class Encoder:
                 _set_time(records, path, values)
             else:
                 _set(records, path, values)
-        return data
 
     def arrays(self, table: pl.DataFrame) -> dict[str, NDArray[Any]]:
         """Check and convert the columns of a table to what :meth:`encode` takes.

@@ -62,7 +62,7 @@ def track_of(table: pl.DataFrame | None) -> Track | None:
     finite = pl.all_horizontal(pl.col(POSITION).is_finite())
     if not table.select(finite.all()).item():
         table = table.filter(finite)
-    if not table["t_ns"].is_sorted() or table["t_ns"].is_duplicated().any():
+    if not (np.diff(table["t_ns"].to_numpy()) > 0).all():
         table = table.sort("t_ns", maintain_order=True).unique("t_ns", keep="first", maintain_order=True)
     if table.is_empty():
         return None

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import copy
-import json
 import time
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
+import msgspec
 import numpy as np
 import polars as pl
 
@@ -275,7 +275,8 @@ class Runner:
                     "no_samples",
                     1,
                     None,
-                    f"{self.plan.input}: no finite value in each of {columns}: nothing was computed",
+                    f"{self.plan.input}: no message with a finite value in each of {columns} in the time that "
+                    "was played: nothing was computed",
                 )
             )
             fatal = True
@@ -297,7 +298,7 @@ ANNOTATION_SCHEMA = {
 def annotation_frame(rows: list[tuple[str, int, int, str, dict[str, str]]]) -> pl.DataFrame:
     """Return annotation rows as the table that :meth:`Writer.add_annotations` takes."""
     return pl.DataFrame(
-        [(*r[:4], json.dumps(r[4])) for r in rows], schema=ANNOTATION_SCHEMA, orient="row"
+        [(*r[:4], msgspec.json.encode(r[4]).decode()) for r in rows], schema=ANNOTATION_SCHEMA, orient="row"
     ).sort("start_ns", maintain_order=True)
 
 
