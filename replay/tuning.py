@@ -275,11 +275,12 @@ def _result(
     objective: _Objective, spec: EstimatorSpec, values: Mapping[str, Values], truths: Sequence[Truth]
 ) -> Tuned:
     tried = {p: f for p, f in objective.tried.items() if p is not None}
-    best = min(tried, key=lambda p: tried[p]["objective"])
-    least = tried[best]["objective"]
+    least = min(f["objective"] for f in tried.values())
     if not math.isfinite(least):
         why = f" ({objective.refusal})" if objective.refusal else ""
         raise UsageError(f"tune: none of {len(tried)} points gives a usable run{why}; search elsewhere")
+    equal = [p for p, f in tried.items() if f["objective"] <= (1 + 1e-9) * least]
+    best = equal[len(equal) // 2]  # the middle of a plateau, not its edge
     default = objective.tried[None]["objective"]
     good = [p for p, f in tried.items() if f["objective"] <= (1 + PLATEAU) * least]
     plateau = {
@@ -323,6 +324,4 @@ def _warnings(
         elif value in (min(numbers), max(numbers)):
             yield f"{name}={value:g} is the end of its range: the best may lie beyond"
     if default <= (1 + PLATEAU) * least:
-        yield (
-            f"hardly better than without ({least:.3g} % against {default:.3g} %): keep the parameters you have"
-        )
+        yield (f"hardly better than without ({least:.3g} % against {default:.3g} %): keep what you have")
