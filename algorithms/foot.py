@@ -536,7 +536,7 @@ def _remarks(s: FloatArray, p: Any, rate_hz: float) -> list[Remark]:
                 f"no rest of {p.init_s:g} s anywhere in {elapsed:.1f} s (longest {s[la.REST_BEST]:.2f} "
                 f"s): bias and "
                 "level are unknown, nothing was estimated; stand still at the start, or give a shorter "
-                "init_s",
+                "init_s (preset=short-rest: 0.3 s)",
                 fatal=True,
             )
         )

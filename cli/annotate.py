@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import App, Parameter
 
 from .console import Heading, Outcome, Table
+from .contents import say_losses
 from .options import DEFAULT, QUIET, Common, Force, MaybeOutput, Shown, Strings, instant, settings
 
 if TYPE_CHECKING:
@@ -138,6 +139,7 @@ def list_(
 
     rec = recording.open(path)
     events = to_events(rec.annotations, rec.start_ns or 0)
+    say_losses(rec)
     if tier is not None:
         events = events.filter(tier=tier)
     rows = events.rows(named=True)
@@ -161,5 +163,6 @@ def _write(
         raise UsageError("annotate: give either -o NEW.mcap or --in-place")
     target = rec.path if output is None else output
     total = annotate(rec, table, target, overwrite=force or in_place)
+    say_losses(rec)
     document = {"output": str(target), "added": table.height, "annotations": total}
     return Outcome(document, [Heading(f"wrote {target}: {table.height} added, {total} annotations")])

@@ -42,7 +42,12 @@ COMMANDS: tuple[tuple[Group, str, str, str], ...] = (
     (HAND, "annotate", "annotate:app", "Add, import or list labelled intervals of a recording."),
     (HAND, "export", "export:export", "Write a recording, or part of it, in another tool's format."),
     (HAND, "demo", "demo:demo", "Simulate, convert, replay, evaluate and export three walks."),
-    (MORE, "completion", "completion:completion", "Print the script that completes commands in your shell, or install it."),
+    (
+        MORE,
+        "completion",
+        "completion:completion",
+        "Print the script that completes commands in your shell, or install it.",
+    ),
 )
 """Group, name, where it is, and the first line of its docstring: known without importing the command."""
 

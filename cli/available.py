@@ -39,10 +39,18 @@ def formats(*, common: Common = DEFAULT) -> Outcome:
     return Outcome(document, lines)
 
 
-def estimators(*, common: Common = DEFAULT) -> Outcome:
-    """List the estimators with their parameters."""
+def estimators(*names: str, common: Common = DEFAULT) -> Outcome:
+    """List the estimators, and the parameters of those named.
+
+    Parameters
+    ----------
+    names : str
+        Estimators to describe in full.
+    """
     from .. import algorithms
 
+    for name in names:
+        algorithms.find(name)  # an unknown one is an error that lists them
     entries = [
         {
             "name": name,
@@ -53,7 +61,10 @@ def estimators(*, common: Common = DEFAULT) -> Outcome:
             "presets": kind.presets,
         }
         for name, kind in algorithms.available().items()
+        if not names or name in names
     ]
+    if not names:
+        return Outcome({"estimators": entries}, _overview(entries))
     lines: list[Heading | Table] = []
     for entry in entries:
         offline = " (offline: needs the whole recording)" if entry["offline"] else ""
@@ -80,6 +91,27 @@ def estimators(*, common: Common = DEFAULT) -> Outcome:
             lines.append(Heading(f"  preset {preset}: {chosen}"))
         lines.append(Heading(""))
     return Outcome({"estimators": entries}, lines)
+
+
+def _overview(entries: list[dict[str, Any]]) -> list[Heading | Table]:
+    """Return one line an estimator, and the named parameter sets."""
+    rows = [[e["name"], f"{e['title']}{' (offline)' if e['offline'] else ''}"] for e in entries]
+    sets: dict[tuple[str, str], list[str]] = {}
+    for entry in entries:
+        for preset, values in entry["presets"].items():
+            chosen = ", ".join(f"{key}={value}" for key, value in values.items())
+            sets.setdefault((preset, chosen), []).append(entry["name"])
+    shared = [
+        [preset, chosen, "all" if len(those) == len(entries) else ", ".join(those)]
+        for (preset, chosen), those in sets.items()
+    ]
+    lines: list[Heading | Table] = [Table(["estimator", "what it is"], rows)]
+    if shared:
+        lines += [Heading(""), Table(["preset (-p preset=…)", "sets", "of"], shared)]
+    return [
+        *lines,
+        Heading("\nmarcha estimators NAME… shows the parameters, with units, ranges and defaults"),
+    ]
 
 
 def _parameters(struct: Any) -> list[dict[str, Any]]:

@@ -13,17 +13,19 @@ def completion(
     shell: Literal["zsh", "bash", "fish", "powershell"] | None = None,
     /,
     *,
-    show: bool = False,
+    install: bool = False,
     common: Common = DEFAULT,
 ) -> Outcome:
-    """Install completion for your shell, or print its script.
+    """Print the script that completes commands in your shell, or install it.
+
+    For this shell only: source <(marcha completion bash)
 
     Parameters
     ----------
     shell : str
         Your shell; the one that is running without it.
-    show : bool
-        Print the script instead of installing it.
+    install : bool
+        Write the script where your shell looks for it; bash also gets a line in ~/.bashrc.
     """
     from cyclopts.completion import ShellDetectionError, detect_shell
 
@@ -37,7 +39,7 @@ def completion(
             "completion: cannot tell which shell is running; name it, for example bash"
         ) from None
     app = build()
-    if show:
+    if not install:
         script = app.generate_completion(shell=chosen)
         return Outcome({"shell": chosen, "script": script}, [Heading(script)])
     path: Path = app.install_completion(shell=chosen)

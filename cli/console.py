@@ -15,6 +15,10 @@ LONGEST = 120
 """Characters of a cell; longer values (JSON, hashes) are cut, ``--json`` has them whole."""
 
 
+GUTTER = 2
+"""Characters between the columns of a table."""
+
+
 @dataclass(frozen=True)
 class Heading:
     """A line of text between tables."""
@@ -32,10 +36,13 @@ class Table:
         Titles; one that starts with ``>`` is aligned right.
     rows : sequence of sequences
         Cells; None is shown as ``–``, a float with four significant digits.
+    fold : bool
+        On a terminal that is too narrow, show the columns in several tables, each with the first column.
     """
 
     columns: Sequence[str]
     rows: Sequence[Sequence[Any]]
+    fold: bool = False
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,11 @@ def emit(outcome: Outcome, *, as_json: bool) -> None:
         if isinstance(part, Heading):
             out.print(part.text, soft_wrap=True)
         elif part.rows:
-            wide.print(_grid(part, colour=out.is_terminal))
+            pieces = folded(part, out.width) if part.fold and out.is_terminal else [part]
+            for k, piece in enumerate(pieces):
+                if k:
+                    out.print()
+                wide.print(_grid(piece, colour=out.is_terminal))
 
 
 def emit_json(document: dict[str, Any]) -> None:
@@ -104,11 +115,32 @@ def number(value: Any) -> str:
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
 
 
+def folded(table: Table, width: int) -> list[Table]:
+    """Return the table in pieces no wider than ``width`` characters, each led by the first column."""
+    cells = [
+        [title.removeprefix(">") for title in table.columns],
+        *([number(c) for c in r] for r in table.rows),
+    ]
+    widths = [max(len(row[k]) for row in cells) + GUTTER for k in range(len(table.columns))]
+    groups: list[list[int]] = []
+    room = 0
+    for k in range(1, len(widths)):
+        if not groups or widths[k] > room:
+            groups.append([0])
+            room = width - widths[0]
+        groups[-1].append(k)
+        room -= widths[k]
+    return [
+        Table([table.columns[k] for k in group], [[row[k] for k in group] for row in table.rows])
+        for group in groups
+    ] or [table]
+
+
 def _grid(table: Table, *, colour: bool) -> Any:
     from rich.table import Table as Grid
     from rich.text import Text
 
-    grid = Grid(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="bold" if colour else "")
+    grid = Grid(box=None, pad_edge=False, padding=(0, GUTTER, 0, 0), header_style="bold" if colour else "")
     for title in table.columns:
         right = title.startswith(">")
         justify: Literal["right", "left"] = "right" if right else "left"
@@ -125,6 +157,7 @@ def columns_of(runs: Iterable[tuple[str, dict[str, Any]]], title: str = "metric"
     return Table(
         [title, *(f">{run}" for run, _ in runs)],
         [[name, *(figures.get(name) for _, figures in runs)] for name in names],
+        fold=True,
     )
 
 
@@ -133,10 +166,13 @@ Progress = Callable[[float, float], None]
 
 
 @contextmanager
-def progress(what: str, common: Common, *, counted: bool = False) -> Iterator[Progress | None]:
+def progress(
+    what: str, common: Common, *, counted: bool = False, before: str = ""
+) -> Iterator[Progress | None]:
     """Give a callback that draws a bar on standard error; None without a terminal or where not wanted.
 
-    ``counted`` shows how many instead of a share: for work of unknown length.
+    ``counted`` shows how many instead of a share: for work of unknown length. ``before`` says what goes on
+    until the callback is called for the first time.
     """
     if common.quiet or not sys.stderr.isatty():
         yield None
@@ -154,5 +190,5 @@ def progress(what: str, common: Common, *, counted: bool = False) -> Iterator[Pr
         transient=True,
     )
     with bars:
-        task = bars.add_task(what, total=None)
-        yield lambda done, total: bars.update(task, completed=done, total=total or None)
+        task = bars.add_task(before or what, total=None)
+        yield lambda done, total: bars.update(task, description=what, completed=done, total=total or None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .console import Heading, Outcome, Table
+from .console import Heading, Outcome, Table, complain
 from .errors import DEFECTS, DONE
 from .options import DEFAULT, Common
 
@@ -127,6 +127,13 @@ def check(path: Path, /, *, common: Common = DEFAULT) -> Outcome:
         lines += [Heading("\nwhat the import found in the raw log"), finding_table(imported)]
     document = {"path": str(path), "findings": found, "import_findings": imported}
     return Outcome(document, lines, DEFECTS if found or lossy else DONE)
+
+
+def say_losses(*recs: Recording) -> None:
+    """Say on standard error what could not be read of a damaged recording, as far as it was read."""
+    for rec in recs:
+        for finding in rec.findings:
+            complain(f"warning: {rec.path}: {finding.kind}: {finding.detail}")
 
 
 def import_report(rec: Recording) -> tuple[list[dict[str, Any]], bool]:

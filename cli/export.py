@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from .console import Heading, Outcome
+from .contents import say_losses
 from .options import DEFAULT, Common, Force, Output, Strings, instant, settings
 
 
@@ -57,6 +58,7 @@ def export(
     }
     options |= {key: value for key, value in chosen.items() if value not in (None, ())}
     files = [str(file) for file in ex.export(rec, to, output, options=options, overwrite=force)]
+    say_losses(rec)
     return Outcome(
         {"path": str(path), "format": to, "output": str(output), "files": files},
         [Heading(f"wrote {file}") for file in files],

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from cyclopts import Parameter
 
 from .console import Heading, Outcome, Table, columns_of, progress
-from .contents import finding_entry
+from .contents import finding_entry, say_losses
 from .errors import DEFECTS, DONE, THRESHOLD
 from .options import DEFAULT, Common, Force, MaybeOutput, Shown, Strings, instant, limits, settings
 
@@ -71,7 +71,7 @@ def replay(
         from .. import viz
 
         sinks.append(viz.LiveSink(path=rrd, show=show, overwrite=force))
-    with progress("replay", common) as report:
+    with progress("replay", common, before="replay: estimators are compiled (once on a machine)") as report:
         result = rp.replay(
             rec,
             list(estimator),
@@ -98,6 +98,7 @@ def replay(
             "loop_s": run.loop_s,
             "outputs": list(run.outputs.values()),
             "metrics": run.metrics,
+            "alignment": run.alignment,
             "findings": [finding_entry(f) for f in run.findings],
         }
         for run in result.runs
@@ -113,11 +114,31 @@ def replay(
             [[r["run"], r["estimator"], r["input"], r["samples"], r["loop_s"]] for r in runs],
         ),
         Heading(""),
-        columns_of((r["run"], r["metrics"]) for r in runs),
-        *(Heading(f"{r['run']}: {f['kind']}: {f['detail']}") for r in runs for f in r["findings"]),
+        columns_of((r["run"], _figures(r)) for r in runs),
+        *_remarks(runs),
         *(Heading(f"wrote {p}") for p in (output, rrd) if p),
     ]
+    say_losses(rec)
     return Outcome(document, lines, DEFECTS if any(r["fatal"] for r in runs) else DONE)
+
+
+def _figures(run: dict[str, Any]) -> dict[str, Any]:
+    return run["metrics"] | ({"alignment": run["alignment"]} if run["alignment"] else {})
+
+
+def _remarks(runs: list[dict[str, Any]]) -> list[Heading]:
+    """Return what the user must know; what holds for every run of an input is said once."""
+    said: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for run in runs:
+        for finding in run["findings"]:
+            said.setdefault((finding["kind"], finding["detail"]), []).append(run)
+    lines = []
+    for (kind, detail), those in said.items():
+        inputs = list(dict.fromkeys(run["input"] for run in those))
+        all_of_them = len(those) > 1 and len(those) == sum(run["input"] in inputs for run in runs)
+        whom = ", ".join(inputs if all_of_them else [run["run"] for run in those])
+        lines.append(Heading(f"{whom}: {kind}: {detail.removeprefix(f'{whom}: ')}"))
+    return lines
 
 
 def evaluate(
@@ -155,9 +176,9 @@ def evaluate(
     from .. import replay as rp
 
     bounds = limits(maximum, "--max"), limits(minimum, "--min")
-    evaluation = rp.evaluate(
-        recording.open(path), runs=list(run) or None, alignment=alignment, reference=reference
-    )
+    rec = recording.open(path)
+    evaluation = rp.evaluate(rec, runs=list(run) or None, alignment=alignment, reference=reference)
+    say_losses(rec)
     missed = rp.check_thresholds(evaluation, *bounds)
     runs = msgspec.to_builtins(evaluation.runs)
     figures = [
@@ -165,9 +186,7 @@ def evaluate(
             r["run"],
             {
                 **r["metrics"],
-                "matched (samples)": r["matched"],
-                "dropped (samples)": r["dropped"],
-                "alignment": r["alignment"] or None,
+                **(_comparison(r) if r["alignment"] else {}),
             },
         )
         for r in runs
@@ -182,6 +201,15 @@ def evaluate(
         lines,
         THRESHOLD if missed else DONE,
     )
+
+
+def _comparison(run: dict[str, Any]) -> dict[str, Any]:
+    """Return what was compared with the reference, and how."""
+    return {
+        "matched (samples)": run["matched"],
+        "dropped (samples)": run["dropped"],
+        "alignment": run["alignment"],
+    }
 
 
 def _within(runs: list[dict[str, Any]], tier: str, label: str) -> list[tuple[str, dict[str, Any]]]:

@@ -8,6 +8,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from .console import Heading, Outcome, complain
+from .contents import say_losses
 from .options import DEFAULT, Common, Force
 
 
@@ -43,5 +44,6 @@ def view(
         viz.write_rrd(recs, rrd, overwrite=force)
     else:
         viz.show(recs, web=web, opened=lambda window: complain(f"the viewer is at {window.address}"))
+    say_losses(*recs)
     document = {"paths": [str(p) for p in paths], "rrd": str(rrd) if rrd else None, "web": web}
     return Outcome(document, [Heading(f"wrote {rrd}")] if rrd else [])

@@ -13,9 +13,7 @@ import polars as pl
 from ..recording.errors import MarchaError
 from .contract import ReportBuilder
 from .mapping import Layout
-from .text import read_blocks, shown
-
-_BOM = b"\xef\xbb\xbf"
+from .text import BOM, read_blocks, shown
 
 
 class Cells:
@@ -83,7 +81,7 @@ class Cells:
                     raise MarchaError(
                         f"{self.path}: layout.encoding {self._layout.encoding}: {error}"
                     ) from error
-            piece = piece.removeprefix(_BOM) if k == 0 else piece
+            piece = piece.removeprefix(BOM) if k == 0 else piece
             if b"\r" in piece:
                 piece = piece.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
             if self._layout.separator == "blanks":

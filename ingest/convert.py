@@ -81,6 +81,9 @@ def convert(
     sources = [Path(p) for p in ([paths] if isinstance(paths, str | Path) else paths)]
     out = Path(out)
     chosen = dict(options or {})
+    for k, path in enumerate(sources):
+        if any(path.resolve() == earlier.resolve() for earlier in sources[:k]):
+            raise UsageError(f"{path}: given twice; name each input once")
     if mapping is not None:
         if format not in (None, "table"):
             raise UsageError(f"--map belongs to the format table, not to {format}")

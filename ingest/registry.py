@@ -24,6 +24,23 @@ GROUP = "marcha.importers"
 CANDIDATE, LEAD = 0.3, 0.1
 
 
+_UTF16 = "UTF-16 text; save it as UTF-8 (iconv -f UTF-16 -t UTF-8, or the editor's “Save as”)"
+_OTHERS = {
+    b"\x89MCAP": "a recording already (MCAP); marcha info and marcha replay take it as it is",
+    b"\x1f\x8b": "compressed with gzip; unpack it first (gunzip)",
+    b"BZh": "compressed with bzip2; unpack it first (bunzip2)",
+    b"\xfd7zXZ\x00": "compressed with xz; unpack it first (unxz)",
+    b"7z\xbc\xaf\x27\x1c": "a 7-Zip archive; unpack it first",
+    b"Rar!": "a RAR archive; unpack it first",
+    b"PK\x03\x04": "a damaged zip archive (its table of contents is missing); copy or download it again",
+    b"\xd0\xcf\x11\xe0": "an old Excel workbook; save its sheet as CSV",
+    b"SQLite format 3\x00": "an SQLite database (a ROS 2 bag?); convert the bag to MCAP first",
+    b"\xff\xfe": _UTF16,
+    b"\xfe\xff": _UTF16,
+}
+"""First bytes of files that a user may take for a log, and what to do with them."""
+
+
 class Registered(NamedTuple):
     """One importer and where it comes from.
 
@@ -222,7 +239,7 @@ def _resolve(path: Path, wanted: Registered | None, stack: contextlib.ExitStack)
             return [(wanted.importer.name, path)]
         if not path.stat().st_size:
             raise MarchaError(f"{path}: the file is empty; nothing to convert")
-        raise MarchaError(f"{path}: unknown content; {_tried()}")
+        raise MarchaError(f"{path}: {_known_otherwise(_head(path)) or f'unknown content; {_tried()}'}")
     files = sorted(p for p in folder.rglob("*") if _is_data(p, folder))
     if not files:
         raise MarchaError(f"{path}: the {'folder' if path.is_dir() else 'archive'} holds no files")
@@ -253,6 +270,14 @@ def _candidates(path: Path, wanted: Registered | None) -> list[Candidate]:
 
 def _tried() -> str:
     return f"tried {', '.join(importers())}; give --format, or --map with a TOML mapping of its columns"
+
+
+def _known_otherwise(head: bytes) -> str:
+    """Return what a file is that no importer reads, and the remedy; nothing where it is not known either."""
+    for magic, said in _OTHERS.items():
+        if head.startswith(magic):
+            return said
+    return ""
 
 
 def _is_data(path: Path, folder: Path) -> bool:

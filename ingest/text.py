@@ -14,6 +14,9 @@ from .contract import ReportBuilder
 
 BLOCK_BYTES = 4 << 20
 
+BOM = b"\xef\xbb\xbf"
+"""Byte order mark that some editors put before UTF-8 text."""
+
 
 @dataclass(frozen=True)
 class Rows:
@@ -91,11 +94,12 @@ def integer_rows(
     """
     line = first_line
     ended = True
-    for piece, final in read_blocks(path, size):
+    for k, (piece, final) in enumerate(read_blocks(path, size)):
         if not piece:
             break
         if final:
             ended = piece[-1:] in b"\r\n"
+        piece = piece.removeprefix(BOM) if k == 0 else piece
         rows, passed = rows_of(piece, limits, names, report, first_line=line)
         line += passed
         yield rows

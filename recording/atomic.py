@@ -149,4 +149,6 @@ def _escape(name: str) -> str:
 
 
 def _failure(path: Path, error: OSError) -> MarchaError:
+    if isinstance(error, FileNotFoundError) and not path.parent.exists():
+        return MarchaError(f"{path}: cannot write: there is no folder {path.parent}; make it first")
     return MarchaError(f"{path}: cannot write: {error.strerror or error}; nothing was left there")

@@ -122,7 +122,8 @@ def replay(
                 run.tables = {name: t for name, t in kept.items() if t is not None}
                 if metrics:
                     view = recording_view(rec, run.lineage, run.tables, start_ns, end_ns)
-                    run.metrics = evaluate_run(view).metrics
+                    measured = evaluate_run(view)
+                    run.metrics, run.alignment = measured.metrics, measured.alignment
 
     engine = Engine(
         source,
@@ -152,9 +153,9 @@ def replay(
     if target is not None and tables is None and metrics:
         with open_recording(target) as written:
             found = evaluate(written, runs=[r.run for r in result.runs], intervals=False)
-        measured = {r.run: r.metrics for r in found.runs}
+        evaluated = {r.run: r for r in found.runs}
         for run in result.runs:
-            run.metrics = measured[run.run]
+            run.metrics, run.alignment = evaluated[run.run].metrics, evaluated[run.run].alignment
     return result
 
 

@@ -56,6 +56,8 @@ class Run:
         Whether the results must not be used; no metrics then.
     metrics : dict of str to float
         See :mod:`marcha.replay.metrics`.
+    alignment : str
+        How the track was laid on the reference for them; empty without a reference.
     tables : dict of str to polars.DataFrame
         Results by output (``t_ns``, ``t_log_ns``, columns); empty where they were not kept.
     annotations : polars.DataFrame
@@ -77,6 +79,7 @@ class Run:
     findings: list[Finding]
     fatal: bool
     metrics: dict[str, float] = field(default_factory=dict)
+    alignment: str = ""
     tables: dict[str, pl.DataFrame] = field(default_factory=dict)
     annotations: pl.DataFrame = field(default_factory=pl.DataFrame)
     lineage: dict[str, str] = field(default_factory=dict)

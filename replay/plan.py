@@ -203,7 +203,8 @@ def plan_runs(
     for topic in inputs or ():
         if topic not in source.channels:
             raise UsageError(
-                f"{source.name}: no channel {topic}; there are {', '.join(source.channels) or 'none'}"
+                f"{source.name}: no channel {topic}; there are "
+                f"{', '.join(t for t in source.channels if not t.startswith(NOT_RAW)) or 'none'}"
             )
     runs: list[PlannedRun] = []
     for maker in makers:
@@ -261,7 +262,8 @@ class _Maker:
             self.cls, own, self._name = type(asked), {}, None
         self._instance = None if isinstance(asked, EstimatorSpec | type) else asked
         fields: tuple[str, ...] = getattr(getattr(self.cls, "Params", None), "__struct_fields__", ())
-        self.shared = {} if self._instance is not None else {k: v for k, v in params.items() if k in fields}
+        known = {*fields, *(("preset",) if getattr(self.cls, "presets", None) and self._name else ())}
+        self.shared = {} if self._instance is not None else {k: v for k, v in params.items() if k in known}
         self._given = self.shared | own
         self._rated = "rate_hz" in fields
         self.estimator = self._make(self._given)

@@ -275,8 +275,8 @@ class Runner:
                     "no_samples",
                     1,
                     None,
-                    f"{self.plan.input}: no message with a finite value in each of {columns} in the time that "
-                    "was played: nothing was computed",
+                    f"{self.plan.input}: no message with a finite value in each of {columns} in the time "
+                    "that was played: nothing was computed",
                 )
             )
             fatal = True

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from marcha.cli import contents
 from marcha.cli.app import COMMANDS
-from marcha.cli.console import number
+from marcha.cli.console import Table, folded, number
 from marcha.cli.options import instant, limits, settings
 from marcha.cli.reference import page
 from marcha.recording import UsageError
@@ -187,7 +187,7 @@ def test_a_reader_that_goes_away_is_no_bug(recording: Path) -> None:
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
 def test_completion_script_knows_the_commands(shell: str) -> None:
-    script = marcha("completion", shell, "--show").out
+    script = marcha("completion", shell).out
     assert "replay" in script
     assert "marcha" in script
 
@@ -196,11 +196,29 @@ def test_completion_is_installed_for_the_user(tmp_path: Path) -> None:
     if os.name != "posix":
         pytest.skip("installs into a POSIX home")
     done = marcha_process(
-        "completion", "fish", "--json", code=f"import os; os.environ.update(HOME={str(tmp_path)!r})"
+        "completion",
+        "fish",
+        "--install",
+        "--json",
+        code=f"import os; os.environ.update(HOME={str(tmp_path)!r})",
     )
     path = Path(done.document["path"])
     assert path.is_relative_to(tmp_path)
     assert "replay" in path.read_text()
+
+
+def test_a_table_wider_than_the_terminal_is_folded() -> None:
+    table = Table(
+        ["metric", ">first_run", ">second_run", ">third"], [["closure_m", 1.5, 2.0, 33.0]], fold=True
+    )
+    pieces = folded(table, 24)
+    assert [list(p.columns) for p in pieces] == [
+        ["metric", ">first_run"],
+        ["metric", ">second_run"],
+        ["metric", ">third"],
+    ]
+    assert [list(p.rows[0]) for p in pieces] == [["closure_m", 1.5], ["closure_m", 2.0], ["closure_m", 33.0]]
+    assert folded(table, 80) == [Table(table.columns, [list(table.rows[0])])]
 
 
 # -- progress and colour ----------------------------------------------------------------------------

@@ -59,10 +59,24 @@ def test_estimators_have_parameters_with_units_and_defaults() -> None:
     assert sigma["description"]
 
 
-def test_estimators_for_a_person() -> None:
+def test_estimators_for_a_person_fit_a_screen() -> None:
     out = marcha("estimators").out
+    assert "foot.9iez" in out
+    assert "short-rest" in out
+    assert out.count("\n") < 40
+
+
+def test_a_named_estimator_is_described_in_full() -> None:
+    out = marcha("estimators", "foot.9iez").out
     assert "foot.9iez: " in out
     assert "sigma_acc" in out
+    assert "foot.naive" not in out
+
+
+def test_an_unknown_estimator_cannot_be_described() -> None:
+    done = marcha("estimators", "foot.none")
+    assert done.code == 2
+    assert "foot.9iez" in done.complaint
 
 
 # -- simulate ---------------------------------------------------------------------------------------
@@ -233,6 +247,58 @@ def test_replay_takes_label_input_and_parameters(folder: Path) -> None:
     (run,) = done.document["runs"]
     assert run["run"] == "mine_foot_imu2"
     assert (run["params"]["sigma_acc"], run["params"]["sigma_gyr"]) == (0.5, 0.02)
+
+
+def test_replay_takes_a_preset_for_every_estimator(folder: Path) -> None:
+    several = ("-e", "foot.9iez", "-e", "foot.naive", "--input", "/foot/imu2")
+    done = marcha("replay", folder / "walk.mcap", *several, "-p", "preset=short-rest", "--json")
+    assert [r["params"]["init_s"] for r in done.document["runs"]] == [0.3, 0.3]
+
+
+def test_replay_names_the_alignment_of_its_errors(folder: Path) -> None:
+    done = marcha("replay", folder / "walk.mcap", "-e", "foot.9iez", "--input", "/foot/imu1", "--json")
+    (run,) = done.document["runs"]
+    assert run["metrics"]["ate_rmse_m"] > 0
+    assert run["alignment"] == "se3"
+
+
+def test_what_holds_for_every_run_is_said_once(folder: Path) -> None:
+    several = ("-e", "foot.9iez", "-e", "foot.naive", "-p", "init_s=600")
+    done = marcha("replay", folder / "walk.mcap", *several)
+    assert done.code == 3
+    assert [line.split(":")[0] for line in done.out.splitlines() if "no_rest" in line] in (
+        ["/foot/imu1", "/foot/imu2"],
+        ["/foot/imu1, /foot/imu2"],
+    )
+
+
+def test_a_wrong_input_lists_the_raw_channels_only(folder: Path) -> None:
+    done = marcha("replay", folder / "done.mcap", "-e", "foot.9iez", "--input", "/nope")
+    assert done.code == 2
+    assert "/foot/imu1" in done.complaint
+    assert "/estimate/" not in done.complaint
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("replay", "-e", "foot.naive", "--input", "/foot/imu1"),
+        ("annotate", "list"),
+        ("export", "--to", "csv", "-o", "OUT"),
+    ],
+    ids=["replay", "annotate", "export"],
+)
+def test_every_reader_says_the_loss_of_a_cut_recording(
+    folder: Path, tmp_path: Path, command: tuple[str, ...]
+) -> None:
+    data = (folder / "done.mcap").read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(data[: len(data) // 2])
+    options = [str(tmp_path / "out") if c == "OUT" else c for c in command]
+    groups = 2 if command[0] == "annotate" else 1
+    done = marcha(*options[:groups], cut, *options[groups:])
+    assert "warning" in done.err
+    assert "truncated" in done.err
 
 
 @pytest.mark.parametrize(("start", "end"), [("1", "3"), ("1s", "3000ms"), ("1000000000ns", "0.05m")])

@@ -200,7 +200,7 @@ def test_full_disk(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         (lambda p: p.mkdir(), "holds no files"),
         (lambda p: p.write_bytes(bytes(range(256)) * 50), "unknown content; tried .*mpu6050-serial.*--map"),
         (lambda p: p.write_bytes(b"hello\n" * 50), "unknown content; tried"),
-        (lambda p: p.write_bytes(b"PK\x03\x04" + bytes(100)), "unknown content"),
+        (lambda p: p.write_bytes(b"PK\x03\x04" + bytes(100)), "damaged zip"),
     ],
 )
 def test_nothing_to_read(tmp_path: Path, make: Any, said: str) -> None:

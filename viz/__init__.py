@@ -4,6 +4,11 @@ pictures.
 
 from __future__ import annotations
 
+import os
+
+# Rerun reads this when it is imported. A file that cannot be written is said by us, in one line.
+os.environ.setdefault("RUST_LOG", "warn,re_log_encoding=off,re_sdk=off")
+
 from .figures import figure, save_figure
 from .live import LiveSink, show
 from .rrd import RrdExporter, write_rrd

@@ -129,7 +129,7 @@ def _show_tab(client: Any, layout: dict[str, Any], name: str, path: Path, patien
         try:
             client.take_screenshot(part.removeprefix("view/"))
             return
-        except RuntimeError:
+        except (RuntimeError, ConnectionError):  # the latter while the viewer does not know the view yet
             if time.monotonic() > until:
                 raise MarchaError(f"{path}: the viewer did not show the tab {name!r}") from None
 
