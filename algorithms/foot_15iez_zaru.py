@@ -170,6 +170,7 @@ class Foot15IezZaru(aiding.AidedEstimator):
     title: ClassVar[str] = "error-state Kalman filter, 15 states, zero-velocity and zero-angular-rate updates"
     source: ClassVar[str] = "foot-navigation dissertation, eqs 3.43–3.44"
     Params = Foot15IezZaruAidedParams
+    presets: ClassVar[dict[str, dict[str, Any]]] = base.PRESETS
     state_size: ClassVar[int] = SIZE
     kernel = staticmethod(kernel)
     run = staticmethod(run)

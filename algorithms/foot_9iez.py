@@ -27,6 +27,9 @@ SIZE = _take.size
 
 FIRST_DETECTOR = la.O_REST + 9
 
+PRESETS = foot.FootEstimator.presets | {"device": {"gravity_from_rest": True, "sigma_acc": 0.17}}
+"""``device``: what the errors of an uncalibrated MPU-6050 make of the filter's certainty; docs/estimators.md."""
+
 
 class Foot9IezParams(foot.FootParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Parameters of the nine-state filter."""
@@ -149,6 +152,7 @@ class Foot9Iez(aiding.AidedEstimator):
     title: ClassVar[str] = "error-state Kalman filter, 9 states, zero-velocity updates"
     source: ClassVar[str] = "foot-navigation dissertation, eqs 3.28–3.42"
     Params = Foot9IezAidedParams
+    presets: ClassVar[dict[str, dict[str, Any]]] = PRESETS
     state_size: ClassVar[int] = SIZE
     kernel = staticmethod(kernel)
     run = staticmethod(run)

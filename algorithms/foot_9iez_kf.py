@@ -187,6 +187,7 @@ class Foot9IezKf(foot.FootEstimator):
     title: ClassVar[str] = "9 states, zero-velocity updates, orientation by its own Kalman filter"
     source: ClassVar[str] = "foot-navigation dissertation, section 3.6.2"
     Params = Foot9IezKfParams
+    presets: ClassVar[dict[str, dict[str, Any]]] = base.PRESETS
     state_size: ClassVar[int] = SIZE
     kernel = staticmethod(kernel)
     run = staticmethod(run)

@@ -177,6 +177,7 @@ class Foot9IezMad(foot.FootEstimator):
     title: ClassVar[str] = "9 states, zero-velocity updates, orientation by Madgwick"
     source: ClassVar[str] = "foot-navigation dissertation, eq 3.18; Madgwick 2010"
     Params = Foot9IezMadParams
+    presets: ClassVar[dict[str, dict[str, Any]]] = base.PRESETS
     state_size: ClassVar[int] = SIZE
     kernel = staticmethod(kernel)
     run = staticmethod(run)

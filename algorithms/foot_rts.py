@@ -244,6 +244,7 @@ class FootRts(foot.FootEstimator):
     source: ClassVar[str] = "Rauch, Tung, Striebel 1965; Bierman 1973; Colomar et al. 2012"
     offline: ClassVar[bool] = True
     Params = base.Foot15IezZaruParams
+    presets: ClassVar[dict[str, dict[str, Any]]] = base.Foot15IezZaru.presets
     state_size: ClassVar[int] = base.SIZE
 
     def __init__(self, params: Any = None) -> None:

@@ -209,6 +209,7 @@ class FootUkf(foot.FootEstimator):
     title: ClassVar[str] = "unscented Kalman filter, 9 states, zero-velocity updates"
     source: ClassVar[str] = "Wan and van der Merwe 2000, eqs 15–17; Brossard et al. 2020"
     Params = FootUkfParams
+    presets: ClassVar[dict[str, dict[str, Any]]] = base.PRESETS
     state_size: ClassVar[int] = SIZE
     kernel = staticmethod(kernel)
     run = staticmethod(run)
