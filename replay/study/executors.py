@@ -98,8 +98,8 @@ class Executor:
             first = waiting.pop()
             yield first, _attempt(function, first)
         while waiting or running:
-            # Two tasks a worker: none waits for the parent, and a broken pool loses little.
-            while waiting and len(running) < 2 * self.processes and not lost:
+            # Four tasks a worker: none waits for the parent, and a broken pool loses little.
+            while waiting and len(running) < 4 * self.processes and not lost:
                 try:
                     running[pool.submit(function, waiting[-1])] = waiting[-1]
                 except BrokenProcessPool:

@@ -181,7 +181,9 @@ def run_study(
         function = partial(run_task, Makers(convert, simulate))
         for _ in executor.run(function, plan.preparations(todo)):
             pass  # what cannot be prepared fails again, and is recorded, in its own tasks
-        for task, outcome in executor.run(function, todo):
+        for number, (task, outcome) in enumerate(executor.run(function, todo)):
+            if number == 1 and executor.processes > 1:
+                _load_libraries()  # while others work
             cells = failed(task, outcome) if isinstance(outcome, Exception) else outcome
             store.add(task.name, cells)
             for job in task.jobs:
@@ -194,7 +196,7 @@ def run_study(
         analysed = _analyse(
             config, toml, cells, notes, code, started, scheduler or f"{executor.processes} processes"
         )
-        from .figures import draw  # matplotlib takes half a second: not for importing this room
+        from .figures import draw
 
         pictures = draw(executor, analysed, cells, config)
     files = _write(folder, analysed, pictures)
@@ -209,6 +211,13 @@ def run_study(
         notes=analysed.notes,
         files=files,
     )
+
+
+def _load_libraries() -> None:
+    """Import what analysis and figures need: two seconds that importing this room should not take."""
+    from scipy import stats  # noqa: F401
+
+    from . import figures  # noqa: F401
 
 
 def _plain(config: cfg.StudyConfig) -> Any:
