@@ -7,11 +7,12 @@ import struct
 from collections.abc import Iterator
 from typing import Any
 
+import msgspec
 import polars as pl
 
-from .cdr import CdrError, decode, encode
+from .cdr import CdrError, decode
 from .codec import MAX_TIME_NS, PREFIX, SECOND, Columns, Messages
-from .definitions import Library, load
+from .definitions import Library
 from .errors import MarchaError
 
 EVENT = "foxglove_msgs/msg/Event"
@@ -90,25 +91,35 @@ def _metadata(value: Any) -> str:
 
 def encode_events(rows: pl.DataFrame, channel_id: int) -> Iterator[tuple[int, bytes]]:
     """Yield log time and message record of every annotation of one tier."""
-    library = load(EVENT)
-    definition = next(iter(library.values()))
     for i, (start, end, label, text) in enumerate(
         rows.select("start_ns", "end_ns", "label", "metadata").iter_rows()
     ):
-        pairs = {"label": label, **json.loads(text)}
-        value = {
-            "start_time": {"sec": start // SECOND, "nanosec": start % SECOND},
-            "end_time": {"sec": end // SECOND, "nanosec": end % SECOND},
-            "metadata": [{"key": k, "value": v} for k, v in pairs.items()],
-        }
+        pairs = {"label": label, **msgspec.json.decode(text)}
         try:
-            message = encode(value, definition, library)
+            message = _event(start, end, pairs)
         except CdrError as e:
             raise MarchaError(f"annotations: {label!r} at {start} ns: {e}") from None
         size = len(message) + PREFIX.itemsize - 9
         yield start, _PREFIX.pack(5, size, channel_id, i, start, start) + message
 
 
+def _event(start: int, end: int, pairs: dict[str, str]) -> bytes:
+    """Return the bytes of one event: as ``cdr.encode`` does, ten times as fast; a walk has thousands."""
+    strings = b"".join([_string(text) for pair in pairs.items() for text in pair])
+    times = (*divmod(start, SECOND), *divmod(end, SECOND))
+    last = next(reversed(pairs.values()))
+    padding = -(len(last.encode()) + 1) % 4  # stands between strings, not behind the last
+    return _EVENT.pack(b"\0\1\0\0", *times, len(pairs)) + strings[: len(strings) - padding]
+
+
+def _string(text: str) -> bytes:
+    raw = text.encode() + b"\0"
+    if len(raw) != raw.index(b"\0") + 1:
+        raise CdrError(f"{text!r}: a string may not contain NUL")
+    return len(raw).to_bytes(4, "little") + raw + bytes(-len(raw) % 4)
+
+
+_EVENT = struct.Struct("<4siIiII")
 _PREFIX = struct.Struct("<BQHIQQ")
 """``codec.PREFIX`` for one record."""
 

@@ -9,6 +9,9 @@ import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from marcha.recording.annotations import encode_events
+from marcha.recording.cdr import encode
+from marcha.recording.definitions import load
 from marcha.recording.integrity import structure
 from marcha.recording.provenance import hash_file, provenance, sources_of
 from mcap.reader import make_reader
@@ -49,6 +52,22 @@ def test_others_see_foxglove_events(tmp_path):
     assert (name, topic, log) == ("foxglove_msgs/msg/Event", "/annotation/terrain", 5_000_000_001)
     assert (last.start_time.sec, last.start_time.nanosec, last.end_time.sec) == (5, 1, 9)
     assert {p.key: p.value for p in last.metadata} == {"label": "stairs", "floor": "2"}
+
+
+@given(
+    st.integers(0, 2**31 * 10**9 - 1),
+    st.text(st.characters(exclude_characters="\0", codec="utf-8"), max_size=9),
+    st.dictionaries(*[st.text(st.characters(exclude_characters="\0", codec="utf-8"), max_size=6)] * 2),
+)
+def test_events_have_the_bytes_of_the_general_encoder(start, label, pairs):
+    pairs.pop("label", None)
+    row = {"start_ns": [start], "end_ns": [start], "label": [label], "metadata": [json.dumps(pairs)]}
+    ((_, record),) = encode_events(pl.DataFrame(row), 1)
+    time = {"sec": start // 10**9, "nanosec": start % 10**9}
+    both = [{"key": k, "value": v} for k, v in {"label": label, **pairs}.items()]
+    library = load("foxglove_msgs/msg/Event")
+    value = {"start_time": time, "end_time": time, "metadata": both}
+    assert record[31:] == encode(value, library["foxglove_msgs/Event"], library)
 
 
 def test_metadata_may_be_a_struct_or_left_out(tmp_path):
