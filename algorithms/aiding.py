@@ -3,7 +3,9 @@
 All are off by default and then change no bit. A filter with position and attitude errors calls :func:`aid`
 after its zero-velocity update; every aid is one scalar measurement of an error state, taken by
 :func:`.kalman.update`, so cross-covariances carry it to the other states (a heading error shifts the
-position, too). They act in stance only, once a foot has stood for ``aid_after_s``; so one stance is one
+position, too). A height leaves attitude and gyroscope bias alone (they are considered, after Schmidt): its
+error is mostly the accelerometer's, which the filters do not model, and blaming the tilt for it would turn
+the heading by degrees. Aids act in stance only, once a foot has stood for ``aid_after_s``; so one stance is one
 measurement of height and of heading, not as many as it has samples.
 
 Height update on flat ground ("HUPT"): where a stance is within ``hupt_max_m`` of the height of the one
@@ -311,7 +313,7 @@ def _flat(s: FloatArray, p: int, n: int, pos: int, dx: int, work: int) -> bool:
     if abs(s[POS + 2] - s[LAST + 2]) >= s[HUPT_MAX]:
         s[LEVEL] = s[POS + 2]
         return False
-    kalman.update(s, p, n, dx, work, pos + 2, s[POS + 2] - s[LEVEL], s[R_HUPT], 0)
+    kalman.update(s, p, n, dx, work, pos + 2, s[POS + 2] - s[LEVEL], s[R_HUPT], pos)
     s[HUPT_USED] += 1.0
     return True
 
@@ -397,7 +399,7 @@ def _barometric(s: FloatArray, p: int, n: int, pos: int, dx: int, work: int) -> 
     _forget_pressure(s)
     s[BARO_WAIT] = 0.0
     before = s[dx + pos + 2]
-    kalman.update(s, p, n, dx, work, pos + 2, s[POS + 2] - height, s[R_BARO], 0)
+    kalman.update(s, p, n, dx, work, pos + 2, s[POS + 2] - height, s[R_BARO], pos)
     s[LEVEL] -= s[dx + pos + 2] - before
     s[BARO_USED] += 1.0
 
@@ -408,7 +410,8 @@ def aid(s: FloatArray, r: int, p: int, n: int, att: int, pos: int, dx: int, work
     ``s[dx]``; return whether there is a correction, which the filter then feeds back.
 
     Call it for every released sample, after the zero-velocity update has been fed back, where ``s[ON]``.
-    ``n`` is the number of error states, ``att`` and ``pos`` the first of attitude and position (in n).
+    ``n`` is the number of error states, ``att`` and ``pos`` the first of attitude and position (in n); what
+    comes before ``pos`` (attitude, gyroscope bias) is considered by the heights.
     """
     still = s[r + R_STILL] > 0.5
     if s[STARTED] < 0.5:
