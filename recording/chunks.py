@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 import threading
-import zlib
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -30,6 +29,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
+from .checksum import crc32
 from .codec import PREFIX, Messages
 from .errors import Finding, MarchaError
 
@@ -165,7 +165,7 @@ def _summary(file: FileReader) -> Contents | None:
     if not 8 <= footer.summary_start <= end:
         raise ValueError("the footer points outside the file")
     summary = file.read(footer.summary_start, end - footer.summary_start)
-    crc = zlib.crc32(tail[: _FOOTER_SIZE - 4], zlib.crc32(summary))
+    crc = crc32(tail[: _FOOTER_SIZE - 4], crc32(summary))
     if footer.summary_crc not in (0, crc):
         raise ValueError("the summary's checksum is wrong")
     contents = Contents()
@@ -375,7 +375,7 @@ def read_chunk(file: FileReader, ref: ChunkRef, reuse: bool = False) -> NDArray[
         raise ChunkError(f"{where}: {head.compression}: {e}") from None
     if len(data) != size:
         raise ChunkError(f"{where}: {len(data)} bytes, {size} stated")
-    if head.crc and zlib.crc32(data) != head.crc:
+    if head.crc and crc32(data) != head.crc:
         raise ChunkError(f"{where}: the checksum is wrong")
     return np.frombuffer(data, "u1")
 

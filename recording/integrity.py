@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import zlib
 from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap.opcode import Opcode
 
+from .checksum import crc32
 from .chunks import ChunkError, ChunkRef, add_finding, read_chunk, read_index, split
 from .errors import Finding
 
@@ -103,6 +103,6 @@ def _data_checksum(rec: Recording) -> bool:
     crc, at = 0, 0
     while at < end - 13:
         block = rec.file.read(at, min(_BLOCK, end - 13 - at))
-        crc = zlib.crc32(block, crc)
+        crc = crc32(block, crc)
         at += len(block)
     return int.from_bytes(record[9:], "little") in (0, crc)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import struct
 import threading
-import zlib
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -38,6 +37,7 @@ from numpy.typing import NDArray
 
 from .atomic import AtomicFile
 from .cdr import Bytes
+from .checksum import crc32
 from .errors import UsageError
 
 CHUNK_SIZE = 1 << 20
@@ -202,7 +202,7 @@ class McapFile:
         summary = builder.end()
         head = struct.pack("<BQQQ", Opcode.FOOTER, 20, start, offset_start)
         self._write(summary)
-        self._record(Footer(start, offset_start, zlib.crc32(head, zlib.crc32(summary))))
+        self._record(Footer(start, offset_start, crc32(head, crc32(summary))))
         self._write(MCAP0_MAGIC)
         self._file.commit()
         self._pool.shutdown()
@@ -219,7 +219,7 @@ class McapFile:
 
     def _write(self, data: bytes | memoryview) -> None:
         self._file.write(data)
-        self._crc = zlib.crc32(data, self._crc)
+        self._crc = crc32(data, self._crc)
         self._at += len(data)
 
 
@@ -259,7 +259,7 @@ def pack(
     compressed = _compressor(level).compress(raw)
     first, last = int(log.min()), int(log.max())
     chunk = RecordBuilder()
-    Chunk("zstd", compressed, last, first, zlib.crc32(raw), data.size).write(chunk)
+    Chunk("zstd", compressed, last, first, crc32(raw), data.size).write(chunk)
     entries = np.empty((len(log), 2), "<u8")
     entries[:, 0] = log
     entries[:, 1] = offsets

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import platform
 from collections.abc import Iterable, Mapping
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +26,18 @@ class SourceFile(msgspec.Struct, frozen=True):
     name: str
     size: int
     blake2b: str
+
+
+@cache
+def environment() -> str:
+    """Return the versions that numbers depend on, in one line: Python, NumPy, Numba, Polars and the machine."""
+    names = []
+    for name in ("numpy", "numba", "polars"):
+        try:
+            names.append(f"{name} {version(name)}")
+        except PackageNotFoundError:  # a bundled program without metadata
+            continue
+    return ", ".join([f"Python {platform.python_version()}", *names, platform.machine()])
 
 
 def hash_file(path: Path | str) -> str:
