@@ -5,8 +5,8 @@ after its zero-velocity update; every aid is one scalar measurement of an error 
 :func:`.kalman.update`, so cross-covariances carry it to the other states (a heading error shifts the
 position, too). A height leaves attitude and gyroscope bias alone (they are considered, after Schmidt): its
 error is mostly the accelerometer's, which the filters do not model, and blaming the tilt for it would turn
-the heading by degrees. Aids act in stance only, once a foot has stood for ``aid_after_s``; so one stance is one
-measurement of height and of heading, not as many as it has samples.
+the heading by degrees. Aids act in stance only, once a foot has stood for ``aid_after_s``; so one stance is
+one measurement of height and of heading, not as many as it has samples.
 
 Height update on flat ground ("HUPT"): where a stance is within ``hupt_max_m`` of the height of the one
 before, both are on one level, and the height of the level's first stance is measured. Otherwise the foot has

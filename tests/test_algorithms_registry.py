@@ -81,7 +81,7 @@ def test_unknown_name_lists_what_there_is() -> None:
 
 
 def test_unknown_parameter_lists_what_there_is() -> None:
-    assert "sigma_acc, sigma_gyr" in one_line("foot.9iez", sigma=1)
+    assert "sigma_acc, sigma_baro, sigma_gyr" in one_line("foot.9iez", sigma=1)
 
 
 def test_unknown_preset_lists_what_there_is() -> None:
