@@ -27,8 +27,8 @@ SIZE = _take.size
 
 FIRST_DETECTOR = la.O_REST + 9
 
-PRESETS = foot.FootEstimator.presets | {"device": {"gravity_from_rest": True, "sigma_acc": 0.17}}
-"""``device``: what the errors of an uncalibrated MPU-6050 make of the filter's certainty; docs/estimators.md."""
+PRESETS = foot.FootEstimator.presets | {"device": {"gravity_from_rest": True, "sigma_acc": 0.16}}
+"""``device``: as sure as the errors of an uncalibrated MPU-6050 allow (docs/estimators.md)."""
 
 
 class Foot9IezParams(foot.FootParams, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -51,7 +51,7 @@ def rows(scale: float) -> list[Row]:
 
 
 def _measure(workers: int, walks: int, folder: Path) -> tuple[float, float]:
-    """Return wall and CPU seconds of a whole study; one process means one core, so libraries get one thread."""
+    """Return wall and CPU seconds of a whole study; a process means a core: libraries get one thread."""
     from marcha.replay.study.executors import SINGLE_THREAD
 
     arguments = [str(workers), str(walks), str(folder)]
@@ -86,7 +86,7 @@ def _run(workers: int, walks: int, folder: Path) -> None:
     if result.cells_failed:
         raise RuntimeError(f"{result.cells_failed} cells failed: {result.notes[:1]}")
     if workers > 1:
-        # Waits for the server that workers are forked from: only then their CPU time counts as this process's.
+        # Waits for the server that workers are forked from: only then their CPU time counts as ours.
         forkserver._forkserver._stop()
 
 

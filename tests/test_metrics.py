@@ -81,6 +81,19 @@ def test_distance_goes_from_stance_to_stance_and_path_along_every_sample() -> No
     assert found["path_error_percent"] == pytest.approx(100 * (4 * np.hypot(0.5, 0.5) - 1.6) / 1.6)
 
 
+def test_the_rest_at_the_start_counts_though_the_track_begins_within_it() -> None:
+    # the estimate begins at 0.8 s, at the end of the rest, whose middle lies before it
+    t = np.arange(20) / 10
+    still = np.ones(20, bool)
+    still[[10, 11, 15, 16]] = False
+    x = np.repeat([0.0, 1.0, 2.0], [11, 5, 4])
+    tables = {
+        "pose": pose(t[8:], np.column_stack((x, 0 * x, 0 * x))[8:]),
+        "stance": pl.DataFrame({"t_ns": (t * S).astype(np.int64), "still": still}),
+    }
+    assert distance(view(tables))["distance_m"] == pytest.approx(2.0)
+
+
 def test_nothing_is_measured_of_a_run_without_a_track() -> None:
     nothing = view({}, truth=Truth(True, 22.1), reference=pose(range(4), SQUARE))
     assert [metric(nothing) for metric in (closure, distance, height, reference, consistency)] == [{}] * 5

@@ -44,6 +44,22 @@ def test_presets_of_an_estimator_are_variants(tmp_path: Path) -> None:
     assert [(m.label, m.preset) for m in grid] == [("foot.naive", ""), ("foot.naive tuned", "tuned")]
 
 
+def test_a_detector_may_be_a_preset_that_sets_one(tmp_path: Path) -> None:
+    text = MINIMAL.replace("foot.naive", "foot.9iez") + 'detectors = ["shoe", "shoe-tuned"]\n'
+    plain, tuned = methods(parse(text + 'presets = ["device"]', tmp_path))
+    assert (plain.detector, tuned.detector) == ("shoe", "shoe-tuned")
+    assert (plain.preset, tuned.preset) == ("device", "device")
+    assert plain.params == {"detector": "shoe"}
+    assert tuned.params == {"detector": "shoe", "shoe_max": 1e5}
+
+
+def test_scenarios_are_told_apart_and_rules_are_searched_in_a_walks_configuration() -> None:
+    config, _ = load("foot-consistency")
+    sources, _ = find_sources(config, None, "code")
+    assert {s.configuration for s in sources} >= {"rectangle C33", "straight C33"}
+    assert configuration(config, "straight C33", "/foot/imu2") == "straight, sensor 2"
+
+
 @pytest.mark.parametrize(
     ("extra", "words"),
     [

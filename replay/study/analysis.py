@@ -247,7 +247,8 @@ NEES = {"nees_position_end": 3, "nees_velocity_end": 3}
 def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     """Test every filter's covariance: mean NEES over walks against its chi-square interval.
 
-    Columns: ``metric, filter, detector, configuration`` (empty: all), ``n, mean, median, low, high,
+    Columns: ``metric, filter, detector, configuration`` (empty: all of the same ``clipped``), ``clipped``
+    (apart, since no filter can know what a sensor did beyond its full scale), ``n, mean, median, low, high,
     verdict``.
     """
     rows: list[dict[str, Any]] = []
@@ -256,7 +257,7 @@ def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
         if name not in done.columns:
             continue
         known = done.filter(pl.col(name).is_finite())
-        for by in (("filter", "detector"), FACTORS):
+        for by in (("clipped", "filter", "detector"), ("clipped", *FACTORS)):
             for key, part in known.group_by(*by, maintain_order=True):
                 mean, n = float(part[name].mean()), part.height  # pyright: ignore[reportArgumentType]
                 low, high = nees_bounds(n, dof, config.statistics.confidence)
@@ -278,11 +279,12 @@ def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
                 )
     schema = {
         **dict.fromkeys(("metric", *FACTORS), pl.String),
+        "clipped": pl.Boolean,
         "n": pl.Int64,
         **dict.fromkeys(("mean", "median", "low", "high"), pl.Float64),
         "verdict": pl.String,
     }
-    return pl.DataFrame(rows, schema=schema)
+    return pl.DataFrame(rows, schema=schema).sort("clipped", maintain_order=True)
 
 
 def remarks(cells: Sequence[Any], config: cfg.StudyConfig) -> list[str]:

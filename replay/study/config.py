@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
+from ...algorithms import available
 from ...recording import UsageError
 
 NonNegative = Annotated[int, msgspec.Meta(ge=0)]
@@ -243,12 +244,14 @@ class StudyConfig(_Table, frozen=True, kw_only=True):
     inputs : list of str
         Globs of the topics that estimators are attached to.
     configurations : list of Grouping
-        Rules in order; the first that fits counts. A simulated walk has the configuration it was made with.
+        Rules in order; the first that fits counts. A simulated walk has the configuration it was made with,
+        and rules are searched in its name.
     estimators : list of Estimators
         What runs.
     detectors : list of str
-        Values of every estimator's ``detector`` parameter. The first is the one that tables and tests between
-        estimators use. Empty keeps the estimators' default.
+        Values of every estimator's ``detector`` parameter, or names of its presets that set one
+        (``shoe-tuned``). The first is the one that tables and tests between estimators use. Empty keeps the
+        estimators' default.
     metrics : list of Metric
         What is tabulated and tested. Every metric is in ``results.parquet`` anyway.
     tracks : bool
@@ -407,8 +410,15 @@ def _grid(entry: Estimators, detectors: list[str]) -> Iterator[Method]:
                 continue
             chosen = detectors if entry.detectors is None else entry.detectors
             for detector in chosen or [""]:
-                extra = {"detector": detector} if detector else {}
-                yield Method(entry.name, label, detector, preset, {**params, **extra})
+                yield Method(entry.name, label, detector, preset, {**params, **_choice(entry.name, detector)})
+
+
+def _choice(estimator: str, detector: str) -> dict[str, Any]:
+    """Return the parameters that choose a detector, given by name or by a preset that sets one."""
+    if not detector:
+        return {}
+    known = getattr(available().get(estimator), "presets", {})
+    return known[detector] if "detector" in known.get(detector, {}) else {"detector": detector}
 
 
 def configuration(config: StudyConfig, name: str, topic: str) -> str:

@@ -26,7 +26,7 @@ from . import config as cfg
 from .analysis import order
 from .cells import Cell
 from .executors import Executor
-from .report import Material, Picture
+from .report import NEES_TITLES, Material, Picture
 from .statistics import normal_quantiles
 
 #: Okabe and Ito (2008): told apart with every kind of colour vision.
@@ -271,24 +271,30 @@ def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> Figure:
     metrics = table["metric"].unique(maintain_order=True).to_list()
     levels = order(table, config)
     filters, configurations = levels["filter"], levels["configuration"]
-    figure = Figure(figsize=(1.5 + 4.2 * len(metrics), 3.9))
+    wide = max(4.2, 0.8 + 0.17 * len(filters) * len(configurations))
+    figure = Figure(figsize=(1.0 + wide * len(metrics), 4.1))
     axes = figure.subplots(1, len(metrics), squeeze=False)[0]
     for ax, metric in zip(axes, metrics, strict=True):
         part = table.filter(metric=metric)
         for row in part.iter_rows(named=True):
             i, k = configurations.index(row["configuration"]), filters.index(row["filter"])
-            x = i - 0.3 + 0.6 * (k + 0.5) / len(filters)
+            x = i - 0.4 + 0.8 * (k + 0.5) / len(filters)
             ax.plot([x, x], [row["low"], row["high"]], color="#9cc79c", linewidth=7, solid_capstyle="butt")
-            ax.plot(x, row["mean"], "o", color=colour(k), markersize=7)
+            face = "white" if row["clipped"] else colour(k)
+            ax.plot(x, row["mean"], "o", color=colour(k), markerfacecolor=face, markersize=6)
         ax.set_xticks(range(len(configurations)), configurations)
         ax.set_xlim(-0.5, len(configurations) - 0.5)
         _log_scale(ax)
-        ax.set(title=metric, xlabel="configuration", ylabel="mean NEES (1)")
+        ax.set(title=NEES_TITLES.get(metric, metric), xlabel="configuration", ylabel="mean NEES (1)")
     handles = [
         Line2D([], [], marker="o", linestyle="", color=colour(k), label=f) for k, f in enumerate(filters)
     ]
     band = Patch(facecolor="#9cc79c", label="interval of a consistent filter")
-    figure.legend(handles=[*handles, band], loc="outside lower center", ncols=5, frameon=False)
+    hollow = Line2D(
+        [], [], marker="o", linestyle="", color=GREY, markerfacecolor="white", label="clipped input"
+    )
+    more = [band, hollow] if table["clipped"].any() else [band]
+    figure.legend(handles=[*handles, *more], loc="outside lower center", ncols=5, frameon=False)
     figure.suptitle("Consistency of the filters' covariance")
     return figure
 

@@ -45,7 +45,8 @@ class Source(msgspec.Struct, frozen=True):
     scenario, seed : str, int
         What to simulate.
     configuration : str
-        Configuration of a simulated walk; empty where the study's rules decide.
+        Configuration of a simulated walk, with the scenario before it where there are several; empty where
+        the study's rules decide.
     size : int
         Bytes, for ordering.
     """
@@ -216,6 +217,7 @@ def _source(recordings: cfg.Recordings, name: str, path: Path, code: str) -> Sou
 
 def _walks(simulate: cfg.Simulate, code: str) -> list[Source]:
     walks: list[Source] = []
+    several = len(simulate.scenarios) > 1
     for scenario in simulate.scenarios:
         for label, sensor in simulate.configurations.items():
             for number in range(1, simulate.walks + 1):
@@ -231,7 +233,7 @@ def _walks(simulate: cfg.Simulate, code: str) -> list[Source]:
                         options=options,
                         scenario=scenario,
                         seed=seed,
-                        configuration=label,
+                        configuration=f"{scenario} {label}" if several else label,
                     )
                 )
     return walks

@@ -69,6 +69,9 @@ class Material(msgspec.Struct, frozen=True):
     toml: str
 
 
+NEES_TITLES = {"nees_position_end": "position at the end", "nees_velocity_end": "velocity at the end"}
+
+
 def number(value: float | None, digits: int = 3) -> str:
     """Return a number with ``digits`` significant digits, or a dash where there is none."""
     if value is None or not math.isfinite(value):
@@ -334,27 +337,47 @@ def _gallery(html: Html, pictures: Sequence[Picture], title: str, section: str) 
 def _consistency(html: Html, material: Material, pictures: Sequence[Picture]) -> None:
     html.section("Consistency of the filters' own covariance")
     html.text(
-        "NEES: the squared error at the end of the walk in units of the filter's covariance. Its mean over "
-        "independent "
-        "walks lies in the interval if the filter knows how wrong it is; above it the filter is too sure of "
-        "itself, "
-        "below it too careful."
+        "NEES: the squared error at the end of the walk in units of the filter's own standard deviations, 3 "
+        "on average for a position or velocity in space. Its mean over independent walks lies in the interval "
+        "if the filter knows how wrong it is; above it the filter is too sure, below it too careful."
     )
-    rows = [
-        [
-            escape(r["filter"]),
-            escape(r["detector"]),
-            escape(r["configuration"] or "all"),
-            escape(r["metric"]),
-            number(r["mean"]),
-            number(r["median"]),
-            f"{number(r['low'])} … {number(r['high'])}",
-            str(r["n"]),
-            escape(r["verdict"]),
+    table = material.consistency
+    if table["clipped"].any():
+        html.text(
+            "Clipped inputs stand apart: what a sensor did beyond its full scale is in no model, so there no "
+            "filter can be consistent, and every error counts against it.",
+            "note",
+        )
+    rows: list[list[str]] = []
+    for clipped, title in ((False, "unclipped inputs"), (True, "clipped inputs")):
+        part = table.filter(pl.col("clipped") == clipped)
+        if len(part):
+            rows.append([title])
+        rows += [
+            [
+                escape(r["filter"]),
+                escape(r["detector"]),
+                escape(r["configuration"] or "all"),
+                escape(NEES_TITLES.get(r["metric"], r["metric"])),
+                number(r["mean"]),
+                number(r["median"]),
+                f"{number(r['low'])} … {number(r['high'])}",
+                str(r["n"]),
+                ("" if r["verdict"] == "consistent" else "@differs ") + escape(r["verdict"]),
+            ]
+            for r in part.iter_rows(named=True)
         ]
-        for r in material.consistency.iter_rows(named=True)
+    head = [
+        "filter",
+        "detector",
+        "configuration",
+        "error",
+        "mean NEES",
+        "median",
+        "consistent within",
+        "n",
+        "verdict",
     ]
-    head = ["filter", "detector", "configuration", "error", "mean", "median", "consistent", "n", "verdict"]
     html.table(head, rows, 4)
     html.pictures(p for p in pictures if p.section == "consistency")
 

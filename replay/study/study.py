@@ -252,7 +252,9 @@ def _claim(folder: Path, toml: str, *, overwrite: bool, resume: bool) -> None:
 
 
 def _placed(cell: Cell, source: plan.Source, config: cfg.StudyConfig) -> Cell:
-    label = source.configuration or cfg.configuration(config, Path(source.path).name, cell.input)
+    label = source.configuration
+    if config.configurations or not label:
+        label = cfg.configuration(config, label or Path(source.path).name, cell.input)
     return msgspec.structs.replace(cell, configuration=label)
 
 
