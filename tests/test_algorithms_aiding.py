@@ -374,7 +374,7 @@ def test_up_and_down_comes_back_to_the_same_height(name: str, riser: float) -> N
 @pytest.mark.parametrize("name", AIDED)
 @pytest.mark.parametrize("aid", ["hupt", "barometer"])
 def test_a_height_leaves_the_heading_alone(name: str, aid: str) -> None:
-    """An accelerometer off by 0.2 m/s²: blamed on the tilt, its height turned the heading by up to 8 degrees."""
+    """An accelerometer off by 0.2 m/s²: blamed on the tilt, its height turned the heading by 8 degrees."""
     rows, walk = simulated("rectangle", seed=3, laps=8, acc_bias=(0.0, 0.0, -0.2))
     off = run(name, rows)[0]
     on = run(name, with_pressure(rows, walk) if aid == "barometer" else rows, **{aid: True})[0]
