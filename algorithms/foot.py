@@ -609,7 +609,14 @@ def _remarks(s: FloatArray, p: Any, rate_hz: float) -> list[Remark]:
                 fatal=True,
             )
         )
-    elif s[STEP_INDEX] == 0 and s[la.MOVED] > rate_hz:
+    elif s[STEP_INDEX] == 0 and s[la.MOVED] <= rate_hz:
+        found.append(
+            Remark(
+                "no_step",
+                f"after the rest it moved for {s[la.MOVED] / rate_hz:.2f} s only: there is no step in it",
+            )
+        )
+    elif s[STEP_INDEX] == 0:
         found.append(
             Remark("no_step", "the sensor moved, but no step was found: wrong detector or wrong mounting?")
         )

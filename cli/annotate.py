@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from .console import Heading, Outcome, Table
+from .console import Heading, Outcome, Table, complain
 from .contents import say_losses
 from .options import DEFAULT, QUIET, Common, Force, MaybeOutput, Shown, Strings, instant, settings
 
@@ -156,6 +156,8 @@ def list_(
 def _write(
     rec: Recording, table: pl.DataFrame, output: Path | None, *, in_place: bool, force: bool
 ) -> Outcome:
+    import polars as pl
+
     from ..export.annotate import annotate
     from ..recording.errors import UsageError
 
@@ -164,5 +166,10 @@ def _write(
     target = rec.path if output is None else output
     total = annotate(rec, table, target, overwrite=force or in_place)
     say_losses(rec)
+    first, last = rec.start_ns or 0, rec.end_ns or 0
+    if outside := table.filter((pl.col("end_ns") < first) | (pl.col("start_ns") > last)).height:
+        complain(
+            f"warning: {outside} of {table.height} lie outside of the recording's {rec.duration_s:.1f} s"
+        )
     document = {"output": str(target), "added": table.height, "annotations": total}
     return Outcome(document, [Heading(f"wrote {target}: {table.height} added, {total} annotations")])

@@ -30,7 +30,7 @@ class SourceFile(msgspec.Struct, frozen=True):
 
 @cache
 def environment() -> str:
-    """Return the versions that numbers depend on, in one line: Python, NumPy, Numba, Polars and the machine."""
+    """Return the versions that numbers depend on, in one line: Python, NumPy, Numba, Polars, machine."""
     names = []
     for name in ("numpy", "numba", "polars"):
         try:

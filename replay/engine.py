@@ -14,6 +14,7 @@ import numpy as np
 import polars as pl
 
 from ..recording.errors import Finding, UsageError
+from ..recording.provenance import environment
 from .clock import Clock, SystemClock
 from .feed import Feed, GapPolicy, Merged
 from .plan import Plan, PlannedRun
@@ -447,6 +448,7 @@ class Engine:
             "run": plan.run,
             "estimator": plan.name,
             "version": plan.version,
+            "environment": environment(),
             "source": str(getattr(plan.estimator, "source", "")),
             "input": plan.input,
             "inputs": json.dumps(inputs),

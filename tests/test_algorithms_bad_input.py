@@ -74,6 +74,13 @@ def test_a_still_recording_stays_where_it_is_and_says_so(name: str) -> None:
         assert np.abs(positions(result)[-1]).max() < 0.05
 
 
+def test_a_still_recording_that_is_touched_at_the_end_has_no_step() -> None:
+    rows = simulated("still", duration_s=6.0)[0]
+    rows[-5:, 4] += 1.0
+    found = remarks(run("foot.9iez", rows)[1])
+    assert "for 0.05 s only" in found["no_step"].detail
+
+
 @pytest.mark.parametrize("name", FOOT[1:])
 def test_upside_down_gives_the_same_walk(name: str) -> None:
     rows, _ = simulated()

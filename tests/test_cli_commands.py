@@ -439,6 +439,13 @@ def test_annotate_import_of_plain_bids(folder: Path, tmp_path: Path) -> None:
     assert rec.annotations["start_ns"][0] - rec.start_ns == 500_000_000
 
 
+def test_an_annotation_outside_of_the_recording_is_said(folder: Path, tmp_path: Path) -> None:
+    late = ("--label", "x", "--from", "1000", "-o", tmp_path / "late.mcap")
+    done = marcha("annotate", "add", folder / "walk.mcap", *late)
+    assert done.code == 0
+    assert "outside" in done.err
+
+
 def test_annotate_needs_one_place_to_write_to(folder: Path, tmp_path: Path) -> None:
     what = ("annotate", "add", folder / "walk.mcap", "--label", "x", "--from", "1s")
     assert marcha(*what).code == 2

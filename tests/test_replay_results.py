@@ -106,6 +106,7 @@ def test_lineage_names_input_and_every_parameter(path: Path, done: tuple[Any, Re
     assert record["input_recording"] == "walk.mcap"
     assert record["estimator"] == "foot.9iez"
     assert record["version"].startswith("marcha ")
+    assert f"numpy {np.__version__}" in record["environment"]
     assert record["input"] == "/foot/imu2"
     params = json.loads(record["params"])
     assert params["rate_hz"] == pytest.approx(100.0, rel=1e-3)
