@@ -66,7 +66,7 @@ def rows(scale: float) -> list[Row]:
         count = max(1000, int(ROWS * scale))
         _run(_WRITE, text, count)
         theirs = _run(_POLARS, text, 5)["s"]
-        ours = _run(_CONVERT, text, out, 3)
+        ours = _run(_CONVERT, text, out, 5)
         assert ours["rows"] == count
         ratio = ours["s"] / theirs
         long = max(1000, int(LONG * scale))
