@@ -45,9 +45,9 @@ def rows(scale: float) -> list[Row]:
         growth = _peak_mb(large) - _peak_mb(small)
     numpy_loop = "9-state filter in plain NumPy, no files"
     return [
-        _rate("replay per sample, the engine, results in memory", single, numpy_loop, plain, PER_SAMPLE),
+        _rate("replay per sample, results in memory", single, numpy_loop, plain, PER_SAMPLE),
         _rate("replay per sample, all six outputs recorded", written, numpy_loop, plain, PER_SAMPLE),
-        _rate("replay in blocks, the engine, results in memory", kept, "vqf (C++), orientation only", vqf, IN_BLOCKS),
+        _rate("replay in blocks, results in memory", kept, "vqf (C++), orientation only", vqf, IN_BLOCKS),
         _rate("replay in blocks, all six outputs recorded", blocks, numpy_loop, plain, IN_BLOCKS),
         Row(
             f"memory of a recorded replay, {4 * n:,} samples above {n:,}", growth, "MB", "", None, None,
