@@ -27,7 +27,7 @@ def simulate(
     Parameters
     ----------
     scenario : str
-        rectangle, straight, eight, stairs …; an unknown name lists them.
+        rectangle, straight, figure-eight, stairs or still.
     output : Path
         Folder for the raw logs and the truth beside them.
     option : str

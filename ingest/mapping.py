@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import msgspec
 
@@ -197,6 +197,8 @@ def read_mapping(path: Path) -> Mapping:
     except msgspec.ValidationError as error:
         said, _, where = str(error).partition(" - at `$")
         key = where.rstrip("`").lstrip(".") or "top level"
+        if (choices := _choices(key)) and said.startswith("Invalid enum"):
+            said += f"; one of {', '.join(choices)}"
         raise MarchaError(f"{path}: {key}: {said}") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise MarchaError(f"{path}: not TOML: {error}") from error
@@ -279,6 +281,16 @@ def targets(path: Path, mapping: Mapping, index: int, topic: Topic) -> list[Targ
                 f"{where}.columns: {lacking} is missing beside {have[0]}; give a column or a constant"
             )
     return found
+
+
+def _choices(key: str) -> tuple[str, ...]:
+    """Return the words that a key of the mapping may have; nothing where it is no choice."""
+    kind: Any = Mapping
+    for part in key.split("."):
+        if not (isinstance(kind, type) and issubclass(kind, msgspec.Struct)):
+            return ()
+        kind = {f.encode_name: f.type for f in msgspec.structs.fields(kind)}.get(part)
+    return get_args(kind) if get_origin(kind) is Literal else ()
 
 
 def _column(name: str, columns: tuple[Column, ...], named: bool) -> Column | None:

@@ -314,7 +314,7 @@ TIME = '[time]\ncolumn = "t"\nunit = "ms"\n'
         (TIME, "top level: .*`topic`"),
         (IMU, "top level: .*`time`"),
         (f"{TIME}speed = 3\n{IMU}", "time: .*unknown field `speed`"),
-        (f'[time]\ncolumn = "t"\nunit = "h"\n{IMU}', "time.unit: Invalid enum value 'h'"),
+        (f'[time]\ncolumn = "t"\nunit = "h"\n{IMU}', "time.unit: Invalid enum value 'h'; one of s, ms"),
         (f"[time]\n{IMU}", "time: give either time.column or time.rate_hz"),
         (
             f'[time]\ncolumn = "when"\n{IMU}',

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import marcha.recording as mr
 import marcha.replay as rp
@@ -16,6 +18,7 @@ import pytest
 import rerun as rr
 from marcha.recording.errors import MarchaError, OutputExists, UsageError
 from marcha.recording.selection import Selection
+from marcha.viz.artists import Sigma
 from marcha.viz.scene import TIMELINE
 from rerun.chunk import RrdReader
 
@@ -159,6 +162,29 @@ def test_estimates_stand_at_the_time_that_they_speak_of(folder: Path, done: mr.R
     t_ns, z = column(folder / "done.rrd", f"/run/{RUN}/height", "Scalars:scalars")
     np.testing.assert_array_equal(t_ns, pose["t_ns"].to_numpy())
     np.testing.assert_array_equal(z[:, 0], pose["pos_z"].to_numpy())
+
+
+def test_a_reference_s_height_begins_at_zero_as_the_estimates_do(tmp_path: Path) -> None:
+    table = pl.DataFrame({"t_ns": np.arange(5) * 10**7, "pos_x": 0.0, "pos_y": 0.0})
+    table = table.with_columns(
+        pos_z=7.5 + pl.col("t_ns") / 1e9, quat_w=1.0, quat_x=0.0, quat_y=0.0, quat_z=0.0
+    )
+    with mr.create(tmp_path / "a.mcap") as out:
+        out.add_table("/reference/pose", "geometry_msgs/msg/PoseStamped", table)
+    viz.write_rrd(mr.open(tmp_path / "a.mcap"), tmp_path / "a.rrd")
+    _, z = column(tmp_path / "a.rrd", "/reference/height", "Scalars:scalars")
+    np.testing.assert_allclose(z[:, 0], [0.0, 0.01, 0.02, 0.03, 0.04], atol=1e-12)
+
+
+def test_a_band_without_an_error_beside_it_fills_its_plot() -> None:
+    sigma: Any = Sigma.__new__(Sigma)  # without a viewer's scene
+    sigma.groups = {f"sigma_pos_{a}": (f"/run/r/sigma/pos_{a}", 1.0) for a in "xyz"}
+    sigma.scene = SimpleNamespace(columns=lambda *a: None, zoom={})
+    sigma.widest = 0.0
+    t_ns = np.arange(3)
+    sigma.draw(t_ns, pl.DataFrame({f"sigma_pos_{a}": [0.0, 0.01, 0.02] for a in "xyz"}))
+    sigma.end()
+    assert sigma.scene.zoom["/run/r/sigma/pos_x"] == pytest.approx((-0.026, 0.026))
 
 
 def test_every_sample_is_a_point_of_the_trail_and_a_pose_of_the_foot(

@@ -141,6 +141,7 @@ class Pose(Artist):
         if self.scene.shows(self.owner):
             self.scene.tracks[self.base] = self.track
         self.zero: Floats | None = None
+        self.level: float | None = None  # a reference's zero of height is elsewhere: estimates begin at 0
         self.scene.lines(f"{self.base}/height", [self.owner], [self.color])
         self._points(2.0)
         self.turns = set(self.QUATERNION) <= set(self.channel.columns)
@@ -148,12 +149,16 @@ class Pose(Artist):
             self.scene.static(f"{self.base}/foot", rr.TransformAxes3D(0.3))
         for role in ("track", "trail", "mark", *(["foot"] if self.turns else [])):
             self.scene.show(role, self.owner, "track", f"{self.base}/{role}")
-        self.scene.show("height", self.owner, "height (m)", f"{self.base}/height")
+        self.scene.show("height", self.owner, "height above the start (m)", f"{self.base}/height")
 
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
         position = columns_of(block, self.POSITION)
         finite = np.isfinite(position).all(axis=1)
-        self.scalars(f"{self.base}/height", t_ns, position[:, 2])
+        if self.level is None and finite.any():
+            self.level = (
+                float(position[finite][0, 2]) if self.channel.topic.startswith("/reference/") else 0.0
+            )
+        self.scalars(f"{self.base}/height", t_ns, position[:, 2] - (self.level or 0.0))
         t_ns, position = t_ns[finite], position[finite]
         if not t_ns.size:
             return
@@ -272,6 +277,7 @@ class Sigma(Artist):
 
     def begin(self) -> None:
         self.groups = {}
+        self.widest = 0.0
         for key, title, unit in self.GROUPS:
             names = [c for c in self.channel.columns if c.startswith(f"sigma_{key}_")]
             for name, color in zip(names, style.AXES, strict=False):
@@ -292,6 +298,13 @@ class Sigma(Artist):
             sigma = columns_of(block, [name], [factor])[:, 0]
             if np.isfinite(sigma).any():
                 self.scene.columns(path, t_ns, rr.Measurements.columns(values=zero, variances=sigma * sigma))
+                if name.startswith("sigma_pos_"):
+                    self.widest = max(self.widest, float(np.nanmax(sigma)))
+
+    def end(self) -> None:
+        if self.widest > 0.0:  # the viewer's own zoom knows the values, all zero, but not their bands
+            for name in (n for n in self.groups if n.startswith("sigma_pos_")):
+                self.scene.zoom[self.groups[name][0]] = (-1.3 * self.widest, 1.3 * self.widest)
 
 
 class Steps(Artist):

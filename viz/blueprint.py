@@ -173,7 +173,7 @@ def _height(scenes: Sequence[Scene], entries: Sequence[Entry]) -> list[rrb.TimeS
         z = np.concatenate([t.positions[:, 2] for t in tracks])
         margin = 0.1 * (np.ptp(z) + STANDING_M)
         span = (float(z.min() - margin), float(z.max() + margin))
-    return [_plot("height (m)", found, span=span)]
+    return [_plot("height above the start (m)", found, span=span)]
 
 
 def _overview(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Container | None:
@@ -244,8 +244,11 @@ def _compare(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Container
         plots.append(_plot("distance to the reference (m)", distance, span=span))
     errors = _of(entries, "error", "sigma")
     if errors:
+        zoom = {path: span for s in scenes for path, span in s.zoom.items()}
         views = [
-            _plot(f"{owner}: {'error and ' if _of(found, 'error') else ''}±1σ of the position (m)", found)
+            _plot(f"{owner}: error and ±1σ of the position (m)", found)
+            if _of(found, "error")
+            else _plot(f"{owner}: ±1σ of the position (m)", found, span=zoom.get(found[0].path))
             for owner, found in _by_owner(errors)
         ]
         plots.append(views[0] if len(views) == 1 else rrb.Tabs(*views))
