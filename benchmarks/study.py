@@ -87,7 +87,7 @@ def _run(workers: int, walks: int, folder: Path) -> None:
         raise RuntimeError(f"{result.cells_failed} cells failed: {result.notes[:1]}")
     if workers > 1:
         # Waits for the server that workers are forked from: only then their CPU time counts as ours.
-        forkserver._forkserver._stop()
+        forkserver._forkserver._stop()  # pyright: ignore[reportAttributeAccessIssue]
 
 
 if __name__ == "__main__":

@@ -105,11 +105,23 @@ def _axis_label(frame: pl.DataFrame) -> str:
     return f"{metric} ({unit})" if unit else metric
 
 
+class _PlainLogFormatter(LogFormatter):
+    """Plain numbers where a logarithmic axis is labelled; powers of ten are typeset, which is slow."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return f"{x:g}" if super().__call__(x, pos) else ""
+
+
 def _log_scale(ax: Axes) -> None:
-    """Make the vertical axis logarithmic, with plain numbers (powers of ten are typeset, which is slow)."""
     ax.set_yscale("log")
-    ax.yaxis.set_major_formatter(LogFormatter())
-    ax.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.7)))
+    ax.yaxis.set_major_formatter(_PlainLogFormatter())
+    ax.yaxis.set_minor_formatter(_PlainLogFormatter(minor_thresholds=(1.5, 0.7)))
+
+
+def _name_ticks(ax: Axes, labels: Sequence[str], inches: float) -> None:
+    """Label the positions 0, 1 … of the horizontal axis, slanted where they would overlap."""
+    long = 0.09 * max(map(len, labels), default=0) > inches / max(1, len(labels))
+    ax.set_xticks(range(len(labels)), labels, rotation=25 if long else 0, ha="right" if long else "center")
 
 
 def _scale(ax: Axes, frame: pl.DataFrame, log: bool) -> None:
@@ -141,7 +153,8 @@ def box_by_both(frame: pl.DataFrame, config: cfg.StudyConfig, log: bool = False)
     """Box plot of one metric by configuration, and by filter within each."""
     levels = order(frame, config)
     filters, configurations = levels["filter"], levels["configuration"]
-    figure = Figure(figsize=(max(6.0, 1.5 + 0.42 * len(filters) * len(configurations)), 4.0))
+    inches = max(4.5, 0.42 * len(filters) * len(configurations))
+    figure = Figure(figsize=(1.5 + inches, 4.0))
     ax = figure.subplots()
     width = 0.8 / max(1, len(filters))
     for i, configuration in enumerate(configurations):
@@ -149,7 +162,7 @@ def box_by_both(frame: pl.DataFrame, config: cfg.StudyConfig, log: bool = False)
         numbers = [filters.index(s) for s in samples]
         positions = [i - 0.4 + width * (k + 0.5) for k in numbers]
         _box(ax, samples, [colour(k) for k in numbers], positions, 0.8 * width)
-    ax.set_xticks(range(len(configurations)), configurations)
+    _name_ticks(ax, configurations, inches)
     ax.set_xlim(-0.5, len(configurations) - 0.5)
     for i in range(1, len(configurations)):
         ax.axvline(i - 0.5, color="#c8c8c8", linewidth=0.8)
@@ -271,9 +284,16 @@ def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> Figure:
     metrics = table["metric"].unique(maintain_order=True).to_list()
     levels = order(table, config)
     filters, configurations = levels["filter"], levels["configuration"]
-    wide = max(4.2, 0.8 + 0.17 * len(filters) * len(configurations))
-    figure = Figure(figsize=(1.0 + wide * len(metrics), 4.1))
-    axes = figure.subplots(1, len(metrics), squeeze=False)[0]
+    inches = max(3.4, 0.17 * len(filters) * len(configurations))
+    across = inches < 5
+    figure = Figure(
+        figsize=(
+            1.0 + (0.8 + inches) * (len(metrics) if across else 1),
+            4.1 if across else 0.9 + 3.0 * len(metrics),
+        )
+    )
+    shape = (1, len(metrics)) if across else (len(metrics), 1)
+    axes = figure.subplots(*shape, squeeze=False).ravel()
     for ax, metric in zip(axes, metrics, strict=True):
         part = table.filter(metric=metric)
         for row in part.iter_rows(named=True):
@@ -282,7 +302,7 @@ def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> Figure:
             ax.plot([x, x], [row["low"], row["high"]], color="#9cc79c", linewidth=7, solid_capstyle="butt")
             face = "white" if row["clipped"] else colour(k)
             ax.plot(x, row["mean"], "o", color=colour(k), markerfacecolor=face, markersize=6)
-        ax.set_xticks(range(len(configurations)), configurations)
+        _name_ticks(ax, configurations, inches)
         ax.set_xlim(-0.5, len(configurations) - 0.5)
         _log_scale(ax)
         ax.set(title=NEES_TITLES.get(metric, metric), xlabel="configuration", ylabel="mean NEES (1)")

@@ -203,13 +203,17 @@ def _introduction(html: Html, material: Material) -> None:
     walks, clipped = results["recording"].n_unique(), results.filter("clipped")["recording"].n_unique()
     done = results.filter(pl.col("status") == "ok")
     html.text(
-        f"{walks} recordings, {results['filter'].n_unique()} filters, "
-        f"{max(1, results['detector'].n_unique())} detectors, "
-        f"{len(done)} finished cells, {len(results) - len(done)} failed; {clipped} recordings have clipped "
-        "inputs. "
+        f"{_count(walks, 'recording')}, {_count(results['filter'].n_unique(), 'filter')}, "
+        f"{_count(results['detector'].n_unique(), 'detector')}; "
+        f"{_count(len(done), 'finished cell')}, {len(results) - len(done)} failed; "
+        f"{_count(clipped, 'recording')} with clipped inputs. "
         f"A cell is one filter with one detector on one input of one recording."
     )
     html.warning(material.notes)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def _lookup(groups: pl.DataFrame, subset: str = "all") -> dict[tuple[str, str, str, str], dict[str, Any]]:
@@ -337,9 +341,9 @@ def _gallery(html: Html, pictures: Sequence[Picture], title: str, section: str) 
 def _consistency(html: Html, material: Material, pictures: Sequence[Picture]) -> None:
     html.section("Consistency of the filters' own covariance")
     html.text(
-        "NEES: the squared error at the end of the walk in units of the filter's own standard deviations, 3 "
-        "on average for a position or velocity in space. Its mean over independent walks lies in the interval "
-        "if the filter knows how wrong it is; above it the filter is too sure, below it too careful."
+        "NEES: the squared error at the end of the walk in units of the filter's own standard deviations (3 "
+        "on average in space). Its mean over independent walks lies in the interval if "
+        "the filter knows how wrong it is; above it is too sure, below it too careful."
     )
     table = material.consistency
     if table["clipped"].any():
@@ -348,38 +352,45 @@ def _consistency(html: Html, material: Material, pictures: Sequence[Picture]) ->
             "filter can be consistent, and every error counts against it.",
             "note",
         )
-    rows: list[list[str]] = []
-    for clipped, title in ((False, "unclipped inputs"), (True, "clipped inputs")):
-        part = table.filter(pl.col("clipped") == clipped)
-        if len(part):
+    levels = order(table, material.config)
+    for (metric,), errors in table.group_by("metric", maintain_order=True):
+        html.heading(f"{NEES_TITLES.get(str(metric), str(metric))}: mean NEES")
+        rows: list[list[str]] = []
+        for clipped, title in ((False, "unclipped inputs"), (True, "clipped inputs")):
+            part = errors.filter(pl.col("clipped") == clipped)
+            if not len(part):
+                continue
+            shown = [c for c in levels["configuration"] if c and c in part["configuration"]]
+            shown.append("")
+            found = {(r["filter"], r["detector"], r["configuration"]): r for r in part.iter_rows(named=True)}
             rows.append([title])
-        rows += [
-            [
-                escape(r["filter"]),
-                escape(r["detector"]),
-                escape(r["configuration"] or "all"),
-                escape(NEES_TITLES.get(r["metric"], r["metric"])),
-                number(r["mean"]),
-                number(r["median"]),
-                f"{number(r['low'])} … {number(r['high'])}",
-                str(r["n"]),
-                ("" if r["verdict"] == "consistent" else "@differs ") + escape(r["verdict"]),
-            ]
-            for r in part.iter_rows(named=True)
-        ]
-    head = [
-        "filter",
-        "detector",
-        "configuration",
-        "error",
-        "mean NEES",
-        "median",
-        "consistent within",
-        "n",
-        "verdict",
-    ]
-    html.table(head, rows, 4)
+            rows.append(["filter", "detector", *(escape(c) or "all" for c in shown)])
+            for name in levels["filter"]:
+                for detector in levels["detector"]:
+                    entries = [found.get((name, detector, c)) for c in shown]
+                    if any(entries):
+                        rows.append([escape(name), escape(detector), *map(_verdict, entries)])
+            limits = [next(r for r in found.values() if r["configuration"] == c) for c in shown]
+            rows.append(
+                [
+                    "@note consistent within",
+                    "",
+                    *(f"@note {number(r['low'])} … {number(r['high'])} ({r['n']})" for r in limits),
+                ]
+            )
+        width = max(len(r) for r in rows)
+        html.table([""] * width, [r if len(r) == 1 else [*r, *[""] * (width - len(r))] for r in rows], 2)
     html.pictures(p for p in pictures if p.section == "consistency")
+
+
+def _verdict(row: dict[str, Any] | None) -> str:
+    """Return a mean NEES with its verdict; red where the filter is too sure."""
+    if row is None:
+        return "–"
+    if row["verdict"] == "consistent":
+        return number(row["mean"])
+    mark = "@differs " if row["verdict"] == "too sure" else ""
+    return f"{mark}{number(row['mean'])} {row['verdict']}"
 
 
 def _normality(html: Html, material: Material, pictures: Sequence[Picture]) -> None:
