@@ -77,7 +77,7 @@ def _read(path: Path) -> pl.DataFrame:
         return rec.table(TOPIC)
 
 
-def _seconds(call: Callable[[], T], repeats: int = 3) -> tuple[float, T]:
+def _seconds(call: Callable[[], T], repeats: int = 2) -> tuple[float, T]:
     """Return the best time of several calls, as many for us as for the peer, and the last result."""
     start = time.perf_counter()
     result = call()
