@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 
 LEVEL = -3
-"""Compression of estimates: their low bits are noise. Level 1 takes twice as long for files 7 % smaller, level 3
-four times as long for 8 %."""
+"""Compression of estimates: their low bits are noise. Level 1 takes twice as long for files 7 % smaller,
+level 3 more than three times as long for 8 %."""
 
 
 class Sink(Protocol):
