@@ -1,7 +1,7 @@
 """Kalman steps on error-state covariances that lie row by row in a packed buffer.
 
 Plain loops and no BLAS: compiled, interpreted, in a block or one by one give the same bits. Error = estimate
-− truth. Inlined by force: the loops' bounds become constants, and the filters 10 to 20 % faster, with the same
+− truth. Inlined by force: the loops' bounds become constants, and the filters 10 to 20 % faster, same
 bits.
 """
 
