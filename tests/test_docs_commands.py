@@ -75,11 +75,14 @@ def run(block: Block, names: dict[str, Any]) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def recordings(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with walk.mcap (raw and estimates) and other.mcap."""
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with raw.mcap, a few steps, and with estimates: walk.mcap, other.mcap."""
     folder = tmp_path_factory.mktemp("recordings")
-    assert marcha("convert", log, "-o", folder / "raw.mcap", "--set", "conf=3333").code == 0
-    done = marcha("replay", folder / "raw.mcap", "-e", "foot.naive", "-o", folder / "walk.mcap")
+    raw = simulate("straight", folder / "raw", seed=1, length_m=2.8, rest_s=2.1)
+    assert marcha("convert", *raw.paths, "-o", folder / "raw.mcap").code == 0
+    done = marcha(
+        "replay", folder / "raw.mcap", "-e", "foot.naive", "--input", "/foot/imu2", "-o", folder / "walk.mcap"
+    )
     assert done.code == 0
     shutil.copy(folder / "walk.mcap", folder / "other.mcap")
     return folder
@@ -132,7 +135,7 @@ def test_python_of_study(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def called(*args: Any, **kwargs: Any) -> Any:
         calls.append(signature.bind(*args, **kwargs).arguments)
-        given = {f: pl.DataFrame({"metric": ["EP"]}) for f in study.StudyResult.__dataclass_fields__}
+        given = {f: pl.DataFrame({"metric": ["EP"]}) for f in study.StudyResult.__struct_fields__}
         return SimpleNamespace(**given)
 
     monkeypatch.setattr(study, "run_study", called)
