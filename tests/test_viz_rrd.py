@@ -448,3 +448,25 @@ def test_no_display_is_said(done: mr.Recording, monkeypatch: pytest.MonkeyPatch)
 def test_importing_viz_does_not_import_rerun() -> None:
     code = "import sys, marcha.viz; sys.exit('rerun' in sys.modules or 'matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_a_live_view_gathers_what_comes_within_a_tenth_of_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[tuple[str, list[int]]] = []
+
+    class Scene:
+        def write(self, topic: str, table: pl.DataFrame) -> None:
+            shown.append((topic, table["t_ns"].to_list()))
+
+    sink = viz.LiveSink("never-written.rrd")
+    monkeypatch.setattr(sink, "_begun", lambda t_ns: Scene())
+    for t in [*range(0, 1_000_000_000, 10_000_000), 300_000_000]:  # 100 Hz, then a seek backwards
+        for topic in ("/a", "/b"):
+            sink.write(topic, pl.DataFrame({"t_ns": [t], "t_log_ns": [t]}))
+    sink._send()
+    assert len(shown) <= 30
+    for topic in ("/a", "/b"):
+        assert [t for name, times in shown if name == topic for t in times] == [
+            *range(0, 1_000_000_000, 10_000_000),
+            300_000_000,
+        ]
+    assert all(times == sorted(times) for _, times in shown)

@@ -78,6 +78,11 @@ def show(
     return window
 
 
+_BEAT_NS = 100_000_000
+"""Messages are sent together at least so long apart in log time: a viewer shows no more, and a call a message
+and topic would not keep up with real time."""
+
+
 class LiveSink:
     """A replay's sink that shows everything as it comes: in a file, a viewer, a browser, or all of them.
 
@@ -113,6 +118,8 @@ class LiveSink:
         self._show, self._web, self._overwrite, self._browser = show, web, overwrite, open_browser
         self._file: AtomicFile | None = None
         self._scene: Scene | None = None
+        self._held: dict[str, list[pl.DataFrame]] = {}
+        self._sent_ns: int | None = None
         self.viewers: list[Viewer] = []
 
     def open(self, plan: Plan) -> None:
@@ -140,8 +147,22 @@ class LiveSink:
             raise
 
     def write(self, topic: str, table: pl.DataFrame) -> None:
-        """Show messages of one topic."""
-        if table.height:
+        """Show messages of one topic, with all others of the same tenth of a second."""
+        if not table.height:
+            return
+        newest = int(table["t_log_ns"][-1])
+        if self._sent_ns is None or newest < self._sent_ns:  # the first message, or a seek backwards
+            self._send()
+            self._sent_ns = newest
+        self._held.setdefault(topic, []).append(table)
+        if newest - self._sent_ns >= _BEAT_NS:
+            self._send()
+            self._sent_ns = newest
+
+    def _send(self) -> None:
+        held, self._held = self._held, {}
+        for topic, tables in held.items():
+            table = pl.concat(tables) if len(tables) > 1 else tables[0]
             self._begun(int(table["t_ns"][0])).write(topic, table)
 
     def close(self, result: ReplayResult | None) -> None:
@@ -159,6 +180,7 @@ class LiveSink:
             self._abort()
             return
         try:
+            self._send()
             scene = self._begun(0)
             scene.end()
             text = rr.TextDocument(replay_report(result), media_type=rr.MediaType.MARKDOWN)
