@@ -327,7 +327,8 @@ class Steps(Artist):
         self.scalars(self.path, t_ns, columns_of(block, ["length_m"])[:, 0])
         rows = block.select("index", "length_m", "height_m", "heading_rad").rows()
         text = [
-            f"{self.owner}: step {i}, {length:.2f} m, {height:+.2f} m up, towards {np.degrees(heading):.0f}°"
+            f"{self.owner}: step {i}, {length:.2f} m, {round(height, 2) + 0.0:+.2f} m up, "
+            f"towards {round(float(np.degrees(heading)), 0) + 0.0:.0f}°"
             for i, length, height, heading in rows
         ]
         self.scene.columns(
