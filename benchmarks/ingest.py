@@ -29,7 +29,7 @@ with open(out, "wb") as f:
         f.write(table.write_csv(include_header=False, line_terminator="\\r\\n\\r\\n").encode())
 """
 _CONVERT = """
-import json, resource, sys, time
+import json, pathlib, re, sys, time
 from marcha.ingest import convert
 source, out = sys.argv[1:3]
 best = 1e9
@@ -37,8 +37,10 @@ for _ in range(int(sys.argv[3])):
     start = time.perf_counter()
     done = convert(source, out, overwrite=True)
     best = min(best, time.perf_counter() - start)
-peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-print(json.dumps({"s": best, "mb": peak, "rows": done.report.rows_kept}))
+status = pathlib.Path("/proc/self/status")  # ru_maxrss would count the memory of the process that forked us
+peak = re.findall(r"VmHWM:\\s+(\\d+)", status.read_text()) if status.exists() else []
+mb = int(peak[0]) / 1024 if peak else float("nan")
+print(json.dumps({"s": best, "mb": mb, "rows": done.report.rows_kept}))
 """
 _POLARS = """
 import json, sys, time
