@@ -15,7 +15,6 @@ from .contract import AlgorithmError, FloatArray
 from .foot_15iez_zaru import ATT, BACC, BGYR, DX, WORK, XPOS, XVEL, N, P
 from .layout import (
     ACC_N,
-    BIAS_ACC,
     BIAS_GYR,
     O_POSE,
     O_REST,
@@ -31,7 +30,7 @@ from .layout import (
     TAKEN,
     VEL,
 )
-from .rotations import orthonormalize, quat_from_rot, rot_from_quat, turn_nav
+from .rotations import quat_from_rot, rot_from_quat, turn_nav
 
 SEGMENT = 4096
 """Samples whose covariances are held at once; the forward pass is run again segment by segment, backwards."""
@@ -69,13 +68,7 @@ def _correct(s: FloatArray, r: int, log: FloatArray) -> None:
     if foot.at_rest(s, r, s[base.ZARU_AFTER], s[base.ZARU_RATE]):
         for i in range(3):
             _update(s, log, BGYR + i, s[BIAS_GYR + i] - s[r + R_GYR + i], s[base.R_ZARU])
-    for i in range(3):
-        s[POS + i] -= s[DX + XPOS + i]
-        s[VEL + i] -= s[DX + XVEL + i]
-        s[BIAS_GYR + i] -= s[DX + BGYR + i]
-        s[BIAS_ACC + i] -= s[DX + BACC + i]
-    turn_nav(s, ROT, -s[DX + ATT], -s[DX + ATT + 1], -s[DX + ATT + 2])
-    orthonormalize(s, ROT)
+    base.feed_back(s)
 
 
 @njit(cache=True, nogil=True)

@@ -14,7 +14,6 @@ They are given against the device's z-down frame: seen in a z-up frame they are 
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -24,6 +23,7 @@ import numpy as np
 import polars as pl
 
 from ..recording.errors import MarchaError, UsageError
+from ..recording.provenance import hash_file
 from .clock import Clock
 from .columns import Header, find_header, float_blocks, require_header
 from .contract import ChannelSpec, CommonOptions, Import, ReportBuilder
@@ -244,7 +244,7 @@ def _footprints(path: Path, mirror: Mirror) -> tuple[pl.DataFrame, dict[str, str
         "length_m": f"{length:.6g}",
         "strides": str(table.height - 1),
         "source": path.name,
-        "source_blake2b": hashlib.blake2b(path.read_bytes()).hexdigest(),
+        "source_blake2b": hash_file(path),
     }
 
 

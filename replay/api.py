@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import threading
 from collections.abc import Mapping, Sequence
@@ -12,6 +11,7 @@ from typing import Any, Literal
 from ..recording import Recording
 from ..recording import open as open_recording
 from ..recording.errors import OutputExists, UsageError
+from ..recording.provenance import hash_file
 from .clock import Clock
 from .engine import Engine, Progress, ReplayResult, Run
 from .evaluate import evaluate, evaluate_run, recording_view
@@ -170,8 +170,7 @@ class _Digest:
 
     def _run(self) -> None:
         try:
-            with self._path.open("rb") as file:
-                self._result = hashlib.file_digest(file, "blake2b").hexdigest()
+            self._result = hash_file(self._path)
         except BaseException as error:  # raised where the result is asked for
             self._result = error
 
