@@ -1,10 +1,10 @@
 """The study of simulated walks: its time, and what a second process gains.
 
-What is timed is the whole command in a fresh interpreter, from its start to its end: imports, simulation,
-conversion, replay, evaluation, statistics, figures, report. One and two processes are treated alike: the
-same walks into an empty folder, with compiled kernels on disk, libraries held to one thread a process, the
-best of :data:`REPEATS` runs each, in turn. CPU seconds (of all processes, children included) stand beside
-the wall time: on a machine that others use, wall times of two processes suffer more than those of one.
+What is timed is the whole command in a fresh interpreter, from its start until the study is there: imports,
+simulation, conversion, replay, evaluation, statistics, figures, report. One and two processes are treated
+alike: the same walks into an empty folder, with compiled kernels on disk, one thread a process, the best of
+:data:`REPEATS` runs each, in turn. CPU seconds (of all processes, children included) stand beside the wall
+time: on a machine that others use, wall times of two processes suffer more than those of one.
 """
 
 from __future__ import annotations
@@ -56,14 +56,16 @@ def _measure(workers: int, walks: int, folder: Path) -> tuple[float, float]:
 
     arguments = [str(workers), str(walks), str(folder)]
     command = [sys.executable, "-W", "ignore", "-m", "benchmarks.study", *arguments]
-    cpu, wall = _children_cpu(), time.perf_counter()
-    subprocess.run(
+    cpu, begin = _children_cpu(), time.monotonic()
+    done = subprocess.run(
         command,
         env=os.environ | SINGLE_THREAD,
         cwd=Path(__file__).resolve().parents[1],
         check=True,
+        stdout=subprocess.PIPE,
+        text=True,
     )
-    return time.perf_counter() - wall, _children_cpu() - cpu
+    return float(done.stdout) - begin, _children_cpu() - cpu
 
 
 def _children_cpu() -> float:
@@ -83,6 +85,7 @@ def _run(workers: int, walks: int, folder: Path) -> None:
     assert config.simulate is not None
     config = msgspec.structs.replace(config, simulate=msgspec.structs.replace(config.simulate, walks=walks))
     result = run_study(config, folder, workers=workers, convert=convert, simulate=simulate)
+    print(time.monotonic())  # a clock that all processes share; the server takes a while to end
     if result.cells_failed:
         raise RuntimeError(f"{result.cells_failed} cells failed: {result.notes[:1]}")
     if workers > 1:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,6 +14,7 @@ import polars as pl
 from .. import recording as mr
 from ..recording.errors import MarchaError, OutputExists, UsageError
 from ..recording.provenance import provenance
+from ..recording.threads import ahead, helpers
 from . import registry
 from .contract import ChannelSpec, CommonOptions, Import, Report, SourceAttachment
 from .truth import Truth, as_text, read_truth
@@ -105,7 +105,7 @@ def convert(
             "given": ", ".join(p.name for p in sources),
         }
         hashed = [p for _, p in _files([*files, *(truth.files if truth else ())])]
-        origin = stack.enter_context(ThreadPoolExecutor(1)).submit(provenance, hashed, **facts)
+        origin = stack.enter_context(helpers("hash", 1)).submit(provenance, hashed, **facts)
         imported = registered.importer.read(files, settings)
         if strict:
             imported.refuse_changes(files[0])
@@ -114,7 +114,7 @@ def convert(
                 written = _Writer(recording, settings, progress)
                 for spec in imported.channels:
                     written.declare(spec)
-                for topic, table in _ahead(imported.blocks()):
+                for topic, table in ahead(imported.blocks(), "parse"):
                     written.add(topic, table)
                 report = imported.report
                 for spec, table in truth.tables if truth else ():
@@ -179,16 +179,6 @@ class _Writer:
             ConvertedChannel(topic, self._specs[topic].schema, *numbers)
             for topic, numbers in self._counts.items()
         ]
-
-
-def _ahead(items: Iterator[T]) -> Iterator[T]:
-    """Read one item ahead in a thread: parsing and writing use a core each."""
-    end = object()
-    with ThreadPoolExecutor(1) as pool:
-        coming = pool.submit(next, items, end)
-        while (item := coming.result()) is not end:
-            coming = pool.submit(next, items, end)
-            yield item  # type: ignore[misc]
 
 
 def _instant(option: str, text: str) -> int:

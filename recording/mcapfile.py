@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import struct
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,6 +38,7 @@ from .atomic import AtomicFile
 from .cdr import Bytes
 from .checksum import crc32
 from .errors import UsageError
+from .threads import helpers
 
 CHUNK_SIZE = 1 << 20
 """Uncompressed bytes of a chunk: 30 to 60 s of one 100 Hz channel."""
@@ -87,7 +87,7 @@ class McapFile:
         self._metadata: dict[str, MetadataIndex] = {}
         self._crc = 0
         self._at = 0
-        self._pool = ThreadPoolExecutor(min(4, os.cpu_count() or 1), thread_name_prefix="marcha-write")
+        self._pool = helpers("write")
         self._jobs: deque[Future[Packed]] = deque()
         try:
             self._write(MCAP0_MAGIC)

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import heapq
 import json
-import os
 from collections.abc import Collection, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
@@ -38,6 +36,7 @@ from .codec import Columns, Decoder, Encoder, Messages
 from .definitions import load, long_name, parse_full
 from .errors import Finding, MarchaError, UsageError
 from .schemas import SCHEMAS, Schema
+from .threads import helpers, threads
 from .writer import RESERVED
 
 _NOW = {"t_ns": pl.Int64, "t_log_ns": pl.Int64}
@@ -566,10 +565,10 @@ class _Pool:
     """Threads that keep order and run only a few tasks ahead."""
 
     def __init__(self, tasks: int) -> None:
-        self._workers = min(4, os.cpu_count() or 1, max(1, tasks))
+        self._workers = min(threads(), max(1, tasks))
 
     def __enter__(self) -> Self:
-        self._pool = ThreadPoolExecutor(self._workers, thread_name_prefix="marcha-read")
+        self._pool = helpers("read", self._workers)
         return self
 
     def __exit__(self, *error: object) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import queue
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -15,6 +14,7 @@ import polars as pl
 
 from ..recording.errors import Finding, UsageError
 from ..recording.provenance import environment
+from ..recording.threads import ahead
 from .clock import Clock, SystemClock
 from .feed import Feed, GapPolicy, Merged
 from .plan import Plan, PlannedRun
@@ -356,7 +356,8 @@ class Engine:
                 return None
             if self._batches is None:
                 batches = self.source.batches(self._topics, self._position_start(), self._end_ns)
-                self._batches = _Prefetch(batches) if self.source.seekable else batches  # live: has its queue
+                # A live source has a queue of its own.
+                self._batches = ahead(batches, "replay", 2) if self.source.seekable else batches
             batch = next(self._batches, None)
             if batch is None:
                 self._exhausted = True
@@ -504,47 +505,3 @@ def speed_factor(speed: float | str) -> float | None:
     if not 0 < factor < float("inf"):
         raise UsageError(f"speed {speed!r}: expected max or a factor of real time above 0")
     return factor
-
-
-class _Prefetch(Iterator[Batch]):
-    """Reads the next batches in a thread while the estimators work on the present one."""
-
-    DEPTH = 2
-
-    def __init__(self, batches: Iterator[Batch]) -> None:
-        self._ready: queue.Queue[Batch | BaseException | None] = queue.Queue(self.DEPTH)
-        self._stop = threading.Event()
-        self._batches = batches
-        self._thread: threading.Thread | None = threading.Thread(
-            target=self._read, daemon=True, name="replay reader"
-        )
-        self._thread.start()
-
-    def _read(self) -> None:
-        try:
-            for batch in self._batches:
-                self._ready.put(batch)
-                if self._stop.is_set():
-                    return
-            self._ready.put(None)
-        except BaseException as error:  # raised again in the engine's thread
-            self._ready.put(error)
-
-    def __next__(self) -> Batch:
-        item = self._ready.get()
-        if isinstance(item, BaseException):
-            raise item
-        if item is None:
-            self._ready.put(None)
-            raise StopIteration
-        return item
-
-    def close(self) -> None:
-        """Stop the thread and wait for it: nobody else may use the recording meanwhile."""
-        self._stop.set()
-        while self._thread is not None and self._thread.is_alive():
-            try:
-                self._ready.get(timeout=0.05)
-            except queue.Empty:
-                continue
-        self._thread = None

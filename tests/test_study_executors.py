@@ -45,10 +45,31 @@ def test_a_task_that_kills_its_process_costs_only_itself() -> None:
 def test_workers_have_one_thread_and_the_parent_keeps_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("POLARS_MAX_THREADS", raising=False)
     with Executor(2) as executor:
-        here, *others = (outcome for _, outcome in executor.run(threads, [0, 1, 2, 3]))
-    assert here == (os.getpid(), None)
-    assert {o[1] for o in others if not isinstance(o, Exception)} == {SINGLE_THREAD["POLARS_MAX_THREADS"]}
-    assert os.getpid() not in {o[0] for o in others if not isinstance(o, Exception)}
+        outcomes = [outcome for _, outcome in executor.run(threads, [0, 1, 2, 3])]
+    assert {o[1] for o in outcomes if not isinstance(o, Exception)} == {SINGLE_THREAD["POLARS_MAX_THREADS"]}
+    assert "POLARS_MAX_THREADS" not in os.environ
+
+
+def test_no_task_of_a_pool_runs_in_the_parent() -> None:
+    with Executor(2) as executor:
+        outcomes = [outcome for _, outcome in executor.run(threads, [0, 1, 2, 3])]
+    assert os.getpid() not in {o[0] for o in outcomes if not isinstance(o, Exception)}
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("tasks", [[], [1, 2, 4]])
+def test_what_is_to_be_done_meanwhile_is_done_once(workers: int, tasks: list[int]) -> None:
+    calls: list[int] = []
+    with Executor(workers) as executor:
+        assert len(list(executor.run(double, tasks, meanwhile=lambda: calls.append(os.getpid())))) == len(
+            tasks
+        )
+    assert calls == [os.getpid()]
+
+
+def test_a_pool_that_was_warmed_up_and_not_used_closes() -> None:
+    with Executor(2) as executor:
+        executor.warm_up(["marcha.recording"], ["foot.naive", "no.such.estimator"])
 
 
 def test_no_workers_are_refused() -> None:

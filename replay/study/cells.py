@@ -112,6 +112,11 @@ class Makers(msgspec.Struct, frozen=True):
     convert: Callable[..., Any] | None = None
     simulate: Callable[..., Any] | None = None
 
+    @property
+    def modules(self) -> list[str]:
+        """Names of the modules that they need."""
+        return [f.__module__ for f in (self.convert, self.simulate) if f is not None]
+
 
 def run_task(makers: Makers, task: Task) -> list[Cell]:
     """Do one task: prepare the recording and, unless there are no jobs, replay and evaluate it."""
@@ -214,7 +219,7 @@ def chosen(rec: Recording, inputs: Sequence[str]) -> list[str] | None:
 
 
 @lru_cache(maxsize=64)
-def _warm(name: str) -> None:
+def warm(name: str) -> None:
     """Compile an estimator or load it from numba's cache, so that no run time contains it."""
     estimator: Any = make(name)
     if hasattr(estimator, "run_block"):
@@ -225,7 +230,7 @@ def _warm(name: str) -> None:
 def _run(rec: Recording, source: Source, jobs: Sequence[Job], topics: list[str] | None) -> list[Cell]:
     """Replay one recording through all methods in one pass."""
     for job in jobs:
-        _warm(job.method.estimator)
+        warm(job.method.estimator)
     specs = [
         EstimatorSpec(
             job.method.estimator,

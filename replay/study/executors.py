@@ -5,15 +5,19 @@ All three take the same function and yield the same outcomes; only the order dif
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
-from collections.abc import Callable, Iterator, Sequence
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from ...recording import MarchaError, UsageError
+from ...recording.threads import LIMIT
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -26,7 +30,12 @@ SINGLE_THREAD = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
+    LIMIT: "1",
 }
+
+
+#: Environment variable that tells a server whose kernels to load: names of estimators, blanks between.
+ESTIMATORS = "MARCHA_STUDY_ESTIMATORS"
 
 
 def cores() -> int:
@@ -56,7 +65,7 @@ class Executor:
         if scheduler is not None and workers is not None:
             raise UsageError("give either workers or a scheduler: a Dask cluster has workers of its own")
         self.processes = cores() if workers is None else workers
-        self._pool: ProcessPoolExecutor | None = None
+        self._pool: _Pool | None = None
         self._client: Any = None
         if scheduler is not None:
             self._client = _connect(scheduler)
@@ -67,11 +76,21 @@ class Executor:
 
     def __exit__(self, *error: object) -> None:
         if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
+            self._pool.shutdown()
         if self._client is not None:
             self._client.close()
 
-    def run(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outcome[T, R]]:
+    def warm_up(self, modules: Iterable[str], estimators: Iterable[str]) -> None:
+        """Start the processes without waiting for them; they load these modules and estimators' kernels."""
+        if self._client is None and self.processes > 1 and self._pool is None:
+            self._pool = _Pool(self.processes, modules, estimators)
+
+    def run(
+        self,
+        function: Callable[[T], R],
+        tasks: Sequence[T],
+        meanwhile: Callable[[], object] = lambda: None,
+    ) -> Iterator[Outcome[T, R]]:
         """Run ``function`` on every task and yield (task, result or the exception it raised) as they finish.
 
         Parameters
@@ -79,33 +98,38 @@ class Executor:
         function : callable
             Module-level function; function and tasks must be picklable.
         tasks : sequence
-            Where a pool has to be started, the first task runs here meanwhile, and fills numba's caches on
-            disk once for all workers: it should be a cheap one.
+            In the order of their start.
+        meanwhile : callable, optional
+            Called here, once, when others have their first tasks.
         """
         if self._client is not None:
-            return _on_cluster(self._client, function, tasks)
+            return _on_cluster(self._client, function, tasks, meanwhile)
         if self.processes == 1 or (len(tasks) < 2 and self._pool is None):
-            return ((task, _attempt(function, task)) for task in tasks)
-        return self._in_pool(function, tasks)
+            return _here(function, tasks, meanwhile)
+        return self._in_pool(function, tasks, meanwhile)
 
-    def _in_pool(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outcome[T, R]]:
-        waiting = list(reversed(tasks))
+    def _in_pool(
+        self, function: Callable[[T], R], tasks: Sequence[T], meanwhile: Callable[[], object]
+    ) -> Iterator[Outcome[T, R]]:
+        waiting = deque(tasks)
         running: dict[Future[R], T] = {}
         lost: list[T] = []
-        pool = self._pool
-        if pool is None:
-            pool = self._pool = _start(self.processes)
-            first = waiting.pop()
-            yield first, _attempt(function, first)
-        while waiting or running:
+
+        def feed() -> None:
             # Four tasks a worker: none waits for the parent, and a broken pool loses little.
             while waiting and len(running) < 4 * self.processes and not lost:
+                if self._pool is None:
+                    self._pool = _Pool(self.processes)
+                task = waiting.popleft()
                 try:
-                    running[pool.submit(function, waiting[-1])] = waiting[-1]
+                    running[self._pool.submit(function, task)] = task
                 except BrokenProcessPool:
-                    lost.append(waiting[-1])
-                waiting.pop()
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    lost.append(task)
+
+        feed()
+        meanwhile()
+        while running or lost:
+            for future in wait(running, return_when=FIRST_COMPLETED).done if running else ():
                 task = running.pop(future)
                 error = future.exception()
                 if isinstance(error, BrokenProcessPool):
@@ -117,12 +141,20 @@ class Executor:
                 else:
                     raise error
             if lost and not running:
-                pool.shutdown()
+                if self._pool is not None:
+                    self._pool.shutdown()
+                    self._pool = None
                 yield from _one_by_one(function, lost)
-                lost = []
-                self._pool = None
-                if waiting:
-                    pool = self._pool = _start(self.processes)
+                lost.clear()
+            feed()
+
+
+def _here(
+    function: Callable[[T], R], tasks: Sequence[T], meanwhile: Callable[[], object]
+) -> Iterator[Outcome[T, R]]:
+    meanwhile()
+    for task in tasks:
+        yield task, _attempt(function, task)
 
 
 def _attempt(function: Callable[[T], R], task: T) -> R | Exception:
@@ -137,13 +169,8 @@ def _start_worker() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-#: What workers need: imported once, by the server that they are forked from.
-PRELOAD = ["marcha.replay.study.cells", "marcha.replay.study.figures", "marcha.ingest.simulate"]
-
-
 def _ready() -> None:
-    """Make a worker start, and import what the tasks need, before there is one for it."""
-    from . import cells  # noqa: F401
+    """Be there."""
 
 
 @contextmanager
@@ -160,36 +187,75 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
                 os.environ[key] = value
 
 
-def _start(count: int) -> ProcessPoolExecutor:
-    import multiprocessing
+class _Pool:
+    """Processes that start while this one goes on.
 
-    # Not fork: threads of polars and numba do not survive it. A fork server has none of them; it imports
-    # once what all workers need, where the system has it.
-    methods = multiprocessing.get_all_start_methods()
-    context = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
-    context.set_forkserver_preload(PRELOAD)
-    pool = ProcessPoolExecutor(count, context, initializer=_start_worker)
-    with _environment(SINGLE_THREAD):  # read when the server or a worker starts, which submit does
-        for _ in range(count):
-            pool.submit(_ready)
-    return pool
+    Parameters
+    ----------
+    count : int
+        How many.
+    modules, estimators : iterable of str
+        Imported, and their kernels loaded, before there is a task.
+    """
+
+    def __init__(self, count: int, modules: Iterable[str] = (), estimators: Iterable[str] = ()) -> None:
+        # Not fork: threads of polars and numba do not survive it. A fork server has none of them; it loads
+        # once what all workers need, where the system has it.
+        served = "forkserver" in multiprocessing.get_all_start_methods()
+        context = multiprocessing.get_context("forkserver" if served else "spawn")
+        self._pool = ProcessPoolExecutor(count, context, initializer=_start_worker)
+        self._count = count
+        with _environment(SINGLE_THREAD | {ESTIMATORS: " ".join(estimators)}):
+            if served:  # its workers inherit this environment
+                from multiprocessing import forkserver
+
+                context.set_forkserver_preload([f"{__package__}.preload", *modules])
+                forkserver.ensure_running()
+            else:
+                self._make_workers()
+        # A server makes none before it has loaded everything: nobody should wait for that.
+        self._started: Future[None] = Future()
+        threading.Thread(target=self._start, daemon=True, name="study pool").start()
+
+    def _make_workers(self) -> list[Future[None]]:
+        return [self._pool.submit(_ready) for _ in range(self._count)]
+
+    def _start(self) -> None:
+        try:
+            for future in self._make_workers():
+                future.result()
+        except BaseException as error:  # raised again where the pool is used
+            self._started.set_exception(error)
+        else:
+            self._started.set_result(None)
+
+    def submit(self, function: Callable[..., R], *arguments: Any) -> Future[R]:
+        """Have a worker call ``function(*arguments)``; waits until there is one."""
+        self._started.result()
+        return self._pool.submit(function, *arguments)
+
+    def shutdown(self) -> None:
+        """Wait for the running tasks and end the processes."""
+        self._started.exception()
+        self._pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _one_by_one(function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outcome[T, R]]:
     """Find out which task kills its worker: each gets a process of its own."""
     for task in tasks:
-        with _start(1) as pool:
-            try:
-                yield task, pool.submit(_attempt, function, task).result()
-            except BrokenProcessPool:
-                yield (
-                    task,
-                    MarchaError(
-                        "the worker process died: out of memory, a crash in compiled code, or a calling "
-                        "script "
-                        "without `if __name__ == '__main__':`"
-                    ),
-                )
+        pool = _Pool(1)
+        try:
+            yield task, pool.submit(_attempt, function, task).result()
+        except BrokenProcessPool:
+            yield (
+                task,
+                MarchaError(
+                    "the worker process died: out of memory, a crash in compiled code, or a calling script "
+                    "without `if __name__ == '__main__':`"
+                ),
+            )
+        finally:
+            pool.shutdown()
 
 
 def _connect(address: str) -> Any:
@@ -206,11 +272,14 @@ def _connect(address: str) -> Any:
         raise UsageError(f"{address}: no Dask scheduler answers ({reason}); start `dask scheduler`") from None
 
 
-def _on_cluster(client: Any, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outcome[T, R]]:
+def _on_cluster(
+    client: Any, function: Callable[[T], R], tasks: Sequence[T], meanwhile: Callable[[], object]
+) -> Iterator[Outcome[T, R]]:
     from dask.distributed import as_completed  # pyright: ignore[reportMissingImports]
 
     futures = {client.submit(_attempt, function, task, pure=False): task for task in tasks}
     try:
+        meanwhile()
         for future in as_completed(list(futures), loop=client.loop):
             task = futures.pop(future)
             error = future.exception()

@@ -26,7 +26,7 @@ from . import config as cfg
 from .analysis import order
 from .cells import Cell
 from .executors import Executor
-from .report import NEES_TITLES, Material, Picture
+from .report import NEES_TITLES, Picture
 from .statistics import normal_quantiles
 
 #: Okabe and Ito (2008): told apart with every kind of colour vision.
@@ -339,9 +339,10 @@ class Drawing(msgspec.Struct, frozen=True):
     arguments: tuple[Any, ...]
 
 
-def drawings(material: Material, cells: Sequence[Cell], config: cfg.StudyConfig) -> list[Drawing]:
-    """Return all that the study has to show, in the order of the report."""
-    frame, nees = material.values, material.consistency
+def drawings(
+    frame: pl.DataFrame, nees: pl.DataFrame, cells: Sequence[Cell], config: cfg.StudyConfig
+) -> list[Drawing]:
+    """Return all that the study has to show, in the order of the report; see :func:`draw`."""
     levels = order(frame, config)
     first = levels["detector"][0] if levels["detector"] else ""
     detector = f", detector {first}" if first else ""
@@ -405,12 +406,32 @@ def render_drawing(drawing: Drawing) -> Picture | None:
 
 
 def draw(
-    executor: Executor, material: Material, cells: Sequence[Cell], config: cfg.StudyConfig
+    executor: Executor,
+    values: pl.DataFrame,
+    consistency: pl.DataFrame,
+    cells: Sequence[Cell],
+    config: cfg.StudyConfig,
+    meanwhile: Callable[[], object] = lambda: None,
 ) -> list[Picture]:
-    """Draw every figure, by the processes that are there."""
-    todo = drawings(material, cells, config)
+    """Draw every figure, by the processes that are there.
+
+    Parameters
+    ----------
+    executor : Executor
+        Runs the drawing.
+    values, consistency : polars.DataFrame
+        Tables of :mod:`~marcha.replay.study.analysis`.
+    cells : sequence of Cell
+        Their tracks are drawn.
+    config : StudyConfig
+        The study.
+    meanwhile : callable, optional
+        See :meth:`Executor.run`.
+    """
+    todo = drawings(values, consistency, cells, config)
     done: dict[str, Picture | None] = {}
-    for drawing, outcome in executor.run(render_drawing, todo):
+    # From the end of the report, where the largest figures stand: none of them is begun last.
+    for drawing, outcome in executor.run(render_drawing, todo[::-1], meanwhile):
         if isinstance(outcome, Exception):
             raise outcome
         done[drawing.name] = outcome

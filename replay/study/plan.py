@@ -284,9 +284,8 @@ def tasks(
                     folder=str(folder),
                 )
             )
-    # The cheapest first (it warms the caches), then the largest: no long task is left for the end.
-    result.sort(key=lambda t: (-t.source.size, t.source.name))
-    return result[-1:] + result[:-1]
+    # The largest first: no long task is left for the end.
+    return sorted(result, key=lambda t: (-t.source.size, t.source.name))
 
 
 def preparations(todo: Sequence[Task]) -> list[Task]:

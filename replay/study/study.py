@@ -178,12 +178,14 @@ def run_study(
         total, done = len(wanted), len(wanted) - sum(len(t.jobs) for t in todo)
         if progress:
             progress(done, total)
-        function = partial(run_task, Makers(convert, simulate))
+        makers = Makers(convert, simulate)
+        if todo:
+            executor.warm_up(makers.modules, {m.estimator for m in methods})
+            _load_libraries()  # while the processes start
+        function = partial(run_task, makers)
         for _ in executor.run(function, plan.preparations(todo)):
             pass  # what cannot be prepared fails again, and is recorded, in its own tasks
-        for number, (task, outcome) in enumerate(executor.run(function, todo)):
-            if number == 1 and executor.processes > 1:
-                _load_libraries()  # while others work
+        for task, outcome in executor.run(function, todo):
             cells = failed(task, outcome) if isinstance(outcome, Exception) else outcome
             store.add(task.name, cells)
             for job in task.jobs:
@@ -193,22 +195,47 @@ def run_study(
                 progress(done, total)
         cells = [_placed(cell, source, config) for source, job in wanted for cell in finished[job.key]]
         _forget_old_recordings(folder / "recordings", sources)
-        analysed = _analyse(
-            config, toml, cells, notes, code, started, scheduler or f"{executor.processes} processes"
-        )
+        results = tidy(cells)
+        values = analysis.values(results, config)
+        consistency = analysis.consistency(results, config)
+        tables: list[pl.DataFrame] = []
+
         from .figures import draw
 
-        pictures = draw(executor, analysed, cells, config)
-    files = _write(folder, analysed, pictures)
+        pictures = draw(
+            executor,
+            values,
+            consistency,
+            cells,
+            config,
+            meanwhile=lambda: tables.extend(
+                [analysis.groups(values, config), analysis.comparisons(values, config)]
+            ),
+        )
+    groups, comparisons = tables
+    material = Material(
+        config=config,
+        results=results,
+        values=values,
+        groups=groups,
+        comparisons=comparisons,
+        outliers=analysis.outliers(values),
+        published=analysis.beside_published(groups, config),
+        consistency=consistency,
+        notes=[*notes, *analysis.remarks(cells, config)],
+        provenance=_provenance(code, started, scheduler or f"{executor.processes} processes"),
+        toml=toml,
+    )
+    files = _write(folder, material, pictures)
     return StudyResult(
         folder=folder,
         config=config,
-        **{name: getattr(analysed, name) for name in TABLES},
+        **{name: getattr(material, name) for name in TABLES},
         cells_run=sum(c.key not in reused for c in cells),
         cells_reused=sum(c.key in reused for c in cells),
         cells_failed=sum(c.status != "ok" for c in cells),
         elapsed_s=time.perf_counter() - begin,
-        notes=analysed.notes,
+        notes=material.notes,
         files=files,
     )
 
@@ -266,39 +293,16 @@ def _forget_old_recordings(folder: Path, sources: Sequence[plan.Source]) -> None
             path.unlink()
 
 
-def _analyse(
-    config: cfg.StudyConfig,
-    toml: str,
-    cells: list[Cell],
-    notes: list[str],
-    code: str,
-    started: datetime,
-    executor: str,
-) -> Material:
-    """Return everything that the report says, but the pictures."""
-    results = tidy(cells)
-    values = analysis.values(results, config)
-    groups = analysis.groups(values, config)
-    return Material(
-        config=config,
-        results=results,
-        values=values,
-        groups=groups,
-        comparisons=analysis.comparisons(values, config),
-        outliers=analysis.outliers(values),
-        published=analysis.beside_published(groups, config),
-        consistency=analysis.consistency(results, config),
-        notes=[*notes, *analysis.remarks(cells, config)],
-        provenance={
-            "started (UTC)": started.isoformat(timespec="seconds"),
-            "executor": executor,
-            "code hash": code,
-            "Python": platform.python_version(),
-            "system": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-            **{name: metadata.version(name) for name in LIBRARIES},
-        },
-        toml=toml,
-    )
+def _provenance(code: str, started: datetime, executor: str) -> dict[str, str]:
+    """Return what a reader needs to run the study again."""
+    return {
+        "started (UTC)": started.isoformat(timespec="seconds"),
+        "executor": executor,
+        "code hash": code,
+        "Python": platform.python_version(),
+        "system": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
+        **{name: metadata.version(name) for name in LIBRARIES},
+    }
 
 
 def _write(folder: Path, material: Material, pictures: list[Picture]) -> list[Path]:
