@@ -366,9 +366,8 @@ def at_rest(s: FloatArray, r: int, since: float, rate: float) -> bool:
 
 SIGMA = Output(
     "sigma",
-    "marcha_msgs/msg/NamedValues",
+    "marcha_msgs/msg/NavigationSigma",
     tuple(f"sigma_{what}_{axis}" for what in ("pos", "vel", "att") for axis in "xyz"),
-    metadata=(("unit.sigma_pos", "m"), ("unit.sigma_vel", "m/s"), ("unit.sigma_att", "rad")),
 )
 
 

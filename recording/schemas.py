@@ -140,6 +140,11 @@ _IMU_QUAT = _quat("orientation", "rotation from the sensor frame to the navigati
 _ACC = _xyz("acc", "m/s²", "linear_acceleration", "specific force in the sensor frame")
 _GYR = _xyz("gyr", "rad/s", "angular_velocity", "angular rate in the sensor frame")
 _IN_NAV = "of frame_id's or the body's origin in the navigation frame"
+_NAVIGATION_SIGMAS = (
+    ("pos", "m", "position", "standard deviation of the position in the navigation frame"),
+    ("vel", "m/s", "velocity", "standard deviation of the velocity in the navigation frame"),
+    ("att", "rad", "attitude", "standard deviation of the attitude, about the navigation frame's axes"),
+)
 _SD = tuple(
     Column(f"sd_{a}_m", "m", f"position_covariance[{4 * i}]", f"standard deviation, {a}", "sigma")
     for i, a in enumerate(("east", "north", "up"))
@@ -292,6 +297,14 @@ _ALL = (
                     Column("heading_rad", "rad", "heading", "direction in the navigation frame, from x to y"),
                 )
             ),
+        ),
+    ),
+    Schema(
+        "marcha_msgs/msg/NavigationSigma",
+        "the standard deviations that an estimator states of its own position, velocity and attitude",
+        tuple(
+            Group(columns, optional=True, absent=_nan(*columns))
+            for columns in (_xyz(f"sigma_{key}", *rest) for key, *rest in _NAVIGATION_SIGMAS)
         ),
     ),
     Schema(

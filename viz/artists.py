@@ -387,6 +387,7 @@ ARTISTS: dict[str, type[Artist]] = {
     "geometry_msgs/msg/Vector3Stamped": Velocity,
     "marcha_msgs/msg/Stance": Stance,
     "marcha_msgs/msg/Step": Steps,
+    "marcha_msgs/msg/NavigationSigma": Sigma,
     "marcha_msgs/msg/NamedValues": Values,
     "marcha_msgs/msg/RadioSignal": Nothing,
     "marcha_msgs/msg/Ranging": Nothing,
@@ -401,5 +402,5 @@ def artist_of(scene: Scene, channel: ChannelLike) -> Artist:
     """Return the artist that draws a channel."""
     kind = ARTISTS.get(channel.schema, Numbers)
     if kind is Values and channel.columns and all(c.startswith("sigma_") for c in channel.columns):
-        kind = Sigma
+        kind = Sigma  # as marcha wrote them before it had NavigationSigma
     return kind(scene, channel)

@@ -32,6 +32,7 @@ POINTS = 20_000
 
 GRID = {"color": "#DDDDDD", "linewidth": 0.6}
 POSE = "geometry_msgs/msg/PoseStamped"
+POSITION_SIGMA = ("sigma_pos_x", "sigma_pos_y", "sigma_pos_z")
 
 
 def figure(recs: Recording | Sequence[Recording], *, alignment: str = ALIGNMENT) -> Figure:
@@ -141,7 +142,7 @@ class _Scene:
 
     @property
     def with_errors(self) -> bool:
-        return bool(self.compared) or any(_topic(t, "sigma") in self.rec.channels for t in self.tracks)
+        return bool(self.compared) or any(_position_sigma(self.rec, t) for t in self.tracks)
 
     def seconds(self, t_ns: NDArray[np.int64]) -> Floats:
         return (t_ns - self.zero_ns) / 1e9
@@ -149,6 +150,12 @@ class _Scene:
 
 def _topic(run: str, what: str) -> str:
     return f"/estimate/{run}/{what}"
+
+
+def _position_sigma(rec: Recording, run: str) -> str:
+    """Return the topic of a run's standard deviations if it has those of the position, else an empty one."""
+    topic = _topic(run, "sigma")
+    return topic if topic in rec.channels and {*POSITION_SIGMA} <= {*rec.channels[topic].columns} else ""
 
 
 def _scene(rec: Recording, alignment: str) -> _Scene:
@@ -305,10 +312,9 @@ def _errors(ax: Axes, scene: _Scene) -> None:
             t, d = _thin(scene.seconds(found.t_ns), found.distance)
             ax.plot(t, d, color=track.color, linewidth=1.2)
             top = max(top, found.worst_m) if track in inside else top
-        topic = _topic(run, "sigma")
-        if topic in scene.rec.channels:
+        if topic := _position_sigma(scene.rec, run):
             table = scene.rec.table(topic)
-            sigma = np.sqrt(np.sum(table.select(r"^sigma_pos_[xyz]$").to_numpy() ** 2, axis=1))
+            sigma = np.sqrt(np.sum(table.select(POSITION_SIGMA).to_numpy() ** 2, axis=1))
             t, s = _thin(scene.seconds(table["t_ns"].to_numpy()), sigma)
             ax.fill_between(t, 0.0, s, color=track.color, alpha=0.2, linewidth=0)
             top = max(top, float(np.nanmax(sigma, initial=0.0))) if track in inside else top
