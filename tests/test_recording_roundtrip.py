@@ -160,6 +160,7 @@ def test_summary_of_mcap_agrees(everything):
         ("sensor_msgs/msg/JointState", "Scalars"),
         ("geometry_msgs/msg/PoseStamped", "InstancePoses3D"),
         ("marcha_msgs/msg/Stance", "Stance"),
+        ("marcha_msgs/msg/NavigationSigma", "NavigationSigma"),
     ],
 )
 def test_rerun_reads_every_message(tmp_path, schema, kinds):
@@ -205,6 +206,20 @@ def test_absent_parts_of_imu_are_marked_and_stay_absent(tmp_path, columns):
     for prefix, field in fields.items():
         absent = prefix not in columns.split()
         assert (getattr(decoded[0], f"{field}_covariance")[0] == -1) == absent
+        assert math.isnan(getattr(decoded[1], field).x) == absent
+
+
+@pytest.mark.parametrize("groups", ["pos", "vel", "att", "pos vel", "vel att"])
+def test_absent_parts_of_navigation_sigma_are_nan_and_stay_absent(tmp_path, groups):
+    full = sample_table("marcha_msgs/msg/NavigationSigma", 5)
+    table = full.select("t_ns", *(c for c in full.columns[1:] if c.split("_")[1] in groups.split()))
+    path = write(tmp_path / "a.mcap", {"/sigma": ("marcha_msgs/msg/NavigationSigma", table)})
+    assert mr.open(path).table("/sigma").equals(table)
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        decoded = [d for *_, d in reader.iter_decoded_messages()]
+    for key, field in {"pos": "position", "vel": "velocity", "att": "attitude"}.items():
+        absent = key not in groups.split()
         assert math.isnan(getattr(decoded[1], field).x) == absent
 
 

@@ -24,6 +24,8 @@ from marcha.replay import (
     plan_runs,
     replay,
 )
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from .replay_helpers import ACC, IMU, Echo, Smoother, channel, same_bits
 
@@ -85,6 +87,21 @@ def test_estimates_in_the_file_are_those_in_memory(done: tuple[Any, Recording]) 
     for topic, table in tables(result).items():
         written = rec.table(topic, log_time=True)
         assert same_bits({topic: written.select(table.columns)}, {topic: table.cast(dict(written.schema))})  # type: ignore[arg-type]
+
+
+def test_other_tools_read_the_filters_standard_deviations_by_name(done: tuple[Any, Recording]) -> None:
+    topic = "/estimate/foot_9iez_foot_imu1/sigma"
+    table = done[1].table(topic)
+    with done[1].path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        messages = [m for *_, m in reader.iter_decoded_messages(topics=[topic])]
+    assert {m.header.frame_id for m in messages} == {"nav"}
+    for key, field in {"pos": "position", "vel": "velocity", "att": "attitude"}.items():
+        theirs = [[getattr(getattr(m, field), a) for a in "xyz"] for m in messages]
+        ours = table.select(f"sigma_{key}_{a}" for a in "xyz").to_numpy()
+        np.testing.assert_array_equal(np.array(theirs), ours)
+        assert np.isfinite(ours).all()
+        assert (ours[-1] > 0).all()
 
 
 def test_a_detector_that_looks_ahead_is_logged_late(done: tuple[Any, Recording]) -> None:

@@ -47,6 +47,27 @@ def test_the_plan_has_the_positions_of_the_recording(done: mr.Recording) -> None
     np.testing.assert_array_equal(np.column_stack(line.get_data()), expected)
 
 
+def area_of_sigma(rec: mr.Recording) -> float | None:
+    """Return the highest point of the area of the standard deviation; None where none is drawn."""
+    axes = [ax for ax in viz.figure(rec).axes if "1σ" in ax.get_title(loc="left")]
+    areas = [c.get_paths()[0].vertices for ax in axes for c in ax.collections]
+    return max(float(np.max(np.asarray(a)[:, 1])) for a in areas) if areas else None
+
+
+@pytest.mark.parametrize("schema", ["NavigationSigma", "NamedValues"])  # the second: older recordings
+def test_the_area_is_the_standard_deviation_of_the_position_if_it_is_there(
+    done: mr.Recording, tmp_path: Path, schema: str
+) -> None:
+    pose, sigma = (done.table(f"/estimate/{RUN}/{what}") for what in ("pose", "sigma"))
+    for name, table in {"all": sigma, "velocity": sigma.select("t_ns", "^sigma_vel_[xyz]$")}.items():
+        with mr.create(tmp_path / f"{name}.mcap") as out:
+            out.add_table("/estimate/r/pose", "geometry_msgs/msg/PoseStamped", pose)
+            out.add_table("/estimate/r/sigma", f"marcha_msgs/msg/{schema}", table)
+    expected = np.linalg.norm(sigma.select("^sigma_pos_[xyz]$").to_numpy(), axis=1).max()
+    assert area_of_sigma(mr.open(tmp_path / "all.mcap")) == pytest.approx(expected)
+    assert area_of_sigma(mr.open(tmp_path / "velocity.mcap")) is None
+
+
 def test_lanes_show_the_stances(done: mr.Recording) -> None:
     axes = next(ax for ax in viz.figure(done).axes if "stances" in ax.get_title(loc="left"))
     reference = done.table("/reference/stance")["still"].cast(int).to_numpy()

@@ -239,6 +239,37 @@ def test_sigma_is_a_band_about_zero(folder: Path, done: mr.Recording) -> None:
     np.testing.assert_allclose(value[:, 0], np.degrees(sigma["sigma_att_z"].to_numpy()) ** 2, rtol=1e-6)
 
 
+def write_sigma(path: Path, schema: str, table: pl.DataFrame) -> Path:
+    """Write a recording with nothing but a run's standard deviations and return its saved view."""
+    with mr.create(path) as out:
+        out.add_table(f"/estimate/{RUN}/sigma", f"marcha_msgs/msg/{schema}", table, frame_id="nav")
+    viz.write_rrd(mr.open(path), path.with_suffix(".rrd"))
+    return path.with_suffix(".rrd")
+
+
+def test_sigma_of_an_older_recording_looks_the_same(tmp_path: Path, done: mr.Recording) -> None:
+    table = done.table(f"/estimate/{RUN}/sigma")
+    old = write_sigma(tmp_path / "old.mcap", "NamedValues", table)
+    new = write_sigma(tmp_path / "new.mcap", "NavigationSigma", table)
+    assert entities(old) == entities(new)
+    for what, title, unit in (("pos", "position", "m"), ("vel", "velocity", "m/s"), ("att", "attitude", "°")):
+        for axis in "xyz":
+            entity = f"/run/{RUN}/sigma/{what}_{axis}"
+            for path in (old, new):
+                assert statics(path, entity, "Measurements:names") == [f"±1σ {title} {axis}"]
+                assert statics(path, entity, "Measurements:units") == [unit]
+            for component in ("Measurements:variances", "Measurements:values"):
+                for a, b in zip(column(old, entity, component), column(new, entity, component), strict=True):
+                    np.testing.assert_array_equal(a, b)
+
+
+def test_sigma_of_the_position_alone_has_a_band_for_nothing_else(tmp_path: Path, done: mr.Recording) -> None:
+    table = done.table(f"/estimate/{RUN}/sigma").select("t_ns", "^sigma_pos_[xyz]$")
+    path = write_sigma(tmp_path / "a.mcap", "NavigationSigma", table)
+    base = f"/run/{RUN}/sigma/"
+    assert {e.removeprefix(base) for e in entities(path) if e.startswith(base)} == {"pos_x", "pos_y", "pos_z"}
+
+
 def test_steps_are_points_footprints_and_text(folder: Path, done: mr.Recording) -> None:
     step, pose = done.table(f"/estimate/{RUN}/step"), done.table(f"/estimate/{RUN}/pose")
     assert step.height == 8
