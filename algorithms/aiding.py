@@ -41,10 +41,10 @@ import math
 from typing import Annotated, Any, Literal
 
 import msgspec
-from numba import njit
 
 from . import foot, kalman
 from . import layout as la
+from .compiled import compiled
 from .contract import FloatArray, Input, Remark
 from .layout import POS, R_DT, R_EXTRA, R_STILL, ROT, STANCE_S, STARTED, STEP_MIN_M
 from .parameters import meta
@@ -230,19 +230,19 @@ def with_aids(base: type[msgspec.Struct], name: str, module: str) -> type[msgspe
     )
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def wrap(angle: float) -> float:
     """Return ``angle`` (rad) within ±π."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def pressure_height(pressure: float, reference: float, scale: float) -> float:
     """Return the height (m) over the place where the pressure is ``reference``; ``scale`` = T/Λ in m."""
     return scale * (1.0 - (pressure / reference) ** BARO_EXPONENT)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _collect(s: FloatArray, r: int) -> None:
     """Add the readings that arrived with the sample at ``r``: field (in n once started) and pressure."""
     if s[MAG] > 0.5:
@@ -265,19 +265,19 @@ def _collect(s: FloatArray, r: int) -> None:
             s[BARO_SUM] += pressure
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _forget_field(s: FloatArray) -> None:
     kalman.clear(s, MAG_SUM, 3)
     s[MAG_COUNT] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _forget_pressure(s: FloatArray) -> None:
     s[BARO_SUM] = 0.0
     s[BARO_COUNT] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _begin(s: FloatArray) -> None:
     """Turn the field collected in the rest into n; the start is the first stance and the first level."""
     x, y, z = s[MAG_SUM], s[MAG_SUM + 1], s[MAG_SUM + 2]
@@ -289,7 +289,7 @@ def _begin(s: FloatArray) -> None:
     s[SETTLED] = 1.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _lift(s: FloatArray) -> None:
     """End the stance: what the first one with readings saw is what later ones are compared with."""
     s[SETTLED] = 0.0
@@ -307,7 +307,7 @@ def _lift(s: FloatArray) -> None:
     _forget_pressure(s)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _flat(s: FloatArray, p: int, n: int, pos: int, dx: int, work: int) -> bool:
     """Height update of a landing."""
     if abs(s[POS + 2] - s[LAST + 2]) >= s[HUPT_MAX]:
@@ -318,7 +318,7 @@ def _flat(s: FloatArray, p: int, n: int, pos: int, dx: int, work: int) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _end_straight(s: FloatArray) -> None:
     if s[HEADING] == IHDE and s[GRID_KNOWN] < 0.5 and s[RUN] >= s[STRAIGHT_STRIDES]:
         s[GRID] = s[RUN_MEAN]
@@ -326,7 +326,7 @@ def _end_straight(s: FloatArray) -> None:
     s[RUN] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _straight(s: FloatArray, p: int, n: int, att: int, dx: int, work: int) -> bool:
     """Heading from straight walking, at a landing: note the stride's direction, measure if it is straight."""
     x, y = s[POS] - s[LAST], s[POS + 1] - s[LAST + 1]
@@ -374,7 +374,7 @@ def _straight(s: FloatArray, p: int, n: int, att: int, dx: int, work: int) -> bo
     return used
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _magnetic(s: FloatArray, p: int, n: int, att: int, dx: int, work: int) -> bool:
     """Heading from the mean field since the last such measurement."""
     x, y, z = s[MAG_SUM] / s[MAG_COUNT], s[MAG_SUM + 1] / s[MAG_COUNT], s[MAG_SUM + 2] / s[MAG_COUNT]
@@ -392,7 +392,7 @@ def _magnetic(s: FloatArray, p: int, n: int, att: int, dx: int, work: int) -> bo
     return True
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _barometric(s: FloatArray, p: int, n: int, pos: int, dx: int, work: int) -> None:
     """Height from the mean pressure since the last such measurement; the level moves along."""
     height = pressure_height(s[BARO_SUM] / s[BARO_COUNT], s[BARO_REF], s[BARO_SCALE])
@@ -404,7 +404,7 @@ def _barometric(s: FloatArray, p: int, n: int, pos: int, dx: int, work: int) -> 
     s[BARO_USED] += 1.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def aid(s: FloatArray, r: int, p: int, n: int, att: int, pos: int, dx: int, work: int) -> bool:
     """Take what the aids know at the sample at ``r`` into the covariance at ``s[p]`` and the correction at
     ``s[dx]``; return whether there is a correction, which the filter then feeds back.

@@ -36,10 +36,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from . import layout as la
+from .compiled import compiled
 from .layout import (
     BURST_START,
     C_HI,
@@ -88,13 +88,13 @@ STATISTICS: dict[str, tuple[str, ...]] = {
 DEGREES = 180.0 / math.pi
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def record(s: FloatArray, j: int) -> int:
     """Return the offset of sample ``j``'s record in the ring."""
     return int(s[RING]) + (j & int(s[RING_MASK])) * RECORD
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def start_tilt(s: FloatArray) -> None:
     """Take the gravity direction and the reference pitch of the pitch detector from the rest at the start."""
     x, y, z = s[INIT_MEAN], s[INIT_MEAN + 1], s[INIT_MEAN + 2]
@@ -104,12 +104,12 @@ def start_tilt(s: FloatArray) -> None:
         s[PITCH_REF] = _pitch(s)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _pitch(s: FloatArray) -> float:
     return DEGREES * math.atan2(-s[TILT], math.sqrt(s[TILT + 1] * s[TILT + 1] + s[TILT + 2] * s[TILT + 2]))
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def track_tilt(s: FloatArray, r: int) -> None:
     """Carry the gravity direction on by the angular rate of the sample at ``r``, and write its pitch (deg).
 
@@ -138,7 +138,7 @@ def track_tilt(s: FloatArray, r: int) -> None:
     s[r + R_PITCH] = _pitch(s)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _variance(s: FloatArray, field: int, lo: int, hi: int) -> float:
     base, mask = int(s[RING]) + field, int(s[RING_MASK])
     n = hi - lo + 1
@@ -153,7 +153,7 @@ def _variance(s: FloatArray, field: int, lo: int, hi: int) -> float:
     return total / n
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _shoe(s: FloatArray, lo: int, hi: int) -> float:
     base, mask = int(s[RING]), int(s[RING_MASK])
     n = hi - lo + 1
@@ -177,7 +177,7 @@ def _shoe(s: FloatArray, lo: int, hi: int) -> float:
     return total / n
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _moving_variance(s: FloatArray, lo: int, hi: int) -> float:
     base, mask = int(s[RING]), int(s[RING_MASK])
     n = hi - lo + 1
@@ -198,7 +198,7 @@ def _moving_variance(s: FloatArray, lo: int, hi: int) -> float:
     return total / n
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _energy(s: FloatArray, field: int, level: float, lo: int, hi: int) -> float:
     base, mask = int(s[RING]) + field, int(s[RING_MASK])
     total = 0.0
@@ -208,7 +208,7 @@ def _energy(s: FloatArray, field: int, level: float, lo: int, hi: int) -> float:
     return total / (hi - lo + 1)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _judge(s: FloatArray, j: int, last: int) -> None:
     """Write the statistics and the raw decision of sample ``j``; ``last`` is the newest sample there is."""
     lo = max(0, j - int(s[W_LO]))
@@ -240,7 +240,7 @@ def _judge(s: FloatArray, j: int, last: int) -> None:
     s[r + R_RAW] = 1.0 if still else 0.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _fill(s: FloatArray, j: int, last: int) -> None:
     """Close a gap at ``j`` that is shorter than the cleaning window and has still samples on both sides."""
     m = int(s[C_LEN])
@@ -256,7 +256,7 @@ def _fill(s: FloatArray, j: int, last: int) -> None:
     s[r + R_FILLED] = 1.0 if still else 0.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _keep(s: FloatArray, j: int, last: int) -> None:
     """Drop a still stretch around ``j`` that is shorter than the cleaning window."""
     m = int(s[C_LEN])
@@ -274,7 +274,7 @@ def _keep(s: FloatArray, j: int, last: int) -> None:
     s[r + R_STILL] = 1.0 if length >= m else 0.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def decide(s: FloatArray, k: int, last: int) -> None:
     """Advance every stage as far as sample ``k`` allows; past the end (``k > last``) windows are cut off
     there.

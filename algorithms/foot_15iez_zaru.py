@@ -6,11 +6,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, ClassVar
 
-from numba import njit
-
 from . import aiding, foot, kalman, strapdown
 from . import foot_9iez as base
 from . import layout as la
+from .compiled import compiled
 from .contract import FloatArray
 from .layout import ACC_N, BIAS_ACC, BIAS_GYR, POS, R_DT, R_GYR, R_STILL, ROT, STARTED, VEL
 from .parameters import meta
@@ -68,7 +67,7 @@ class Foot15IezZaruParams(base.Foot9IezParams, frozen=True, forbid_unknown_field
 Foot15IezZaruAidedParams = aiding.with_aids(Foot15IezZaruParams, "Foot15IezZaruAidedParams", __name__)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def predict(s: FloatArray, dt: float) -> None:
     """Carry P over one time step: F P Fᵀ + Q (eqs 3.34–3.37 with the bias columns of 3.43)."""
     kalman.predict_motion(s, P, N, ATT, XPOS, XVEL, ACC_N, dt)
@@ -81,7 +80,7 @@ def predict(s: FloatArray, dt: float) -> None:
     kalman.mirror(s, P, N)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def correct(s: FloatArray, r: int) -> None:
     """Correct by zero velocity and, where the foot really rests, by zero angular rate (eq 3.44)."""
     kalman.clear(s, DX, N)
@@ -95,7 +94,7 @@ def correct(s: FloatArray, r: int) -> None:
     feed_back(s)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def feed_back(s: FloatArray) -> None:
     """Take the errors in ``DX`` out of position, velocity, biases and attitude."""
     for i in range(3):
@@ -107,7 +106,7 @@ def feed_back(s: FloatArray) -> None:
     orthonormalize(s, ROT)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _navigate(s: FloatArray, out: FloatArray) -> None:
     r = foot.release(s)
     if not foot.starts(s) and s[STARTED] > 0.5:
@@ -122,7 +121,7 @@ def _navigate(s: FloatArray, out: FloatArray) -> None:
     foot.emit_detector(s, r, base.FIRST_DETECTOR, out)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
     """Take one row; fill ``out`` and return True where a result is due."""
     if not foot.take(state, row):
@@ -131,7 +130,7 @@ def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
     """Take all rows; see :class:`.contract.KernelEstimator`."""
     results = 0
@@ -143,7 +142,7 @@ def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
     return results
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def flush(state: FloatArray, out: FloatArray) -> int:
     """Fill ``out`` with the results still held back, return their number."""
     results = 0

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, ClassVar
 
-from numba import njit
-
 from . import aiding, foot, kalman, strapdown
 from . import layout as la
+from .compiled import compiled
 from .contract import FloatArray
 from .layout import ACC_N, POS, R_DT, R_STILL, ROT, STARTED, VEL
 from .parameters import meta
@@ -55,7 +54,7 @@ class Foot9IezParams(foot.FootParams, frozen=True, forbid_unknown_fields=True, k
 Foot9IezAidedParams = aiding.with_aids(Foot9IezParams, "Foot9IezAidedParams", __name__)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def predict(s: FloatArray, dt: float) -> None:
     """Carry P over one time step: F P Fᵀ + Q with f_n in ``ACC_N`` (eqs 3.34–3.37)."""
     kalman.predict_motion(s, P, N, ATT, XPOS, XVEL, ACC_N, dt)
@@ -64,7 +63,7 @@ def predict(s: FloatArray, dt: float) -> None:
     kalman.mirror(s, P, N)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def zero_velocity(s: FloatArray, considered: int) -> None:
     """Correct by zero velocity (eqs 3.38–3.42); the first ``considered`` error states are left alone."""
     kalman.clear(s, DX, N)
@@ -73,7 +72,7 @@ def zero_velocity(s: FloatArray, considered: int) -> None:
     feed_back(s, considered)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def feed_back(s: FloatArray, considered: int) -> None:
     """Take the errors in ``DX`` out of position, velocity and, unless it is considered, attitude."""
     for i in range(3):
@@ -84,7 +83,7 @@ def feed_back(s: FloatArray, considered: int) -> None:
         orthonormalize(s, ROT)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _navigate(s: FloatArray, out: FloatArray) -> None:
     r = foot.release(s)
     if not foot.starts(s) and s[STARTED] > 0.5:
@@ -99,7 +98,7 @@ def _navigate(s: FloatArray, out: FloatArray) -> None:
     foot.emit_detector(s, r, FIRST_DETECTOR, out)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
     """Take one row; fill ``out`` and return True where a result is due."""
     if not foot.take(state, row):
@@ -108,7 +107,7 @@ def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
     """Take all rows; see :class:`.contract.KernelEstimator`."""
     results = 0
@@ -120,7 +119,7 @@ def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
     return results
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def flush(state: FloatArray, out: FloatArray) -> int:
     """Fill ``out`` with the results still held back, return their number."""
     results = 0

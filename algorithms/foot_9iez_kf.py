@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, ClassVar
 
-from numba import njit
-
 from . import foot, kalman, strapdown
 from . import foot_9iez as base
 from . import layout as la
+from .compiled import compiled
 from .contract import FloatArray
 from .layout import ACC_N, BIAS_GYR, GRAVITY, R_DT, R_GYR, R_NORM_ACC, R_STILL, ROT, STARTED
 from .parameters import meta
@@ -77,7 +76,7 @@ class Foot9IezKfParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=T
     ] = False
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _predict(s: FloatArray, dt: float) -> None:
     kalman.predict_bias(s, P, M, TILT, BIAS, ROT, dt)
     kalman.add_noise(s, P, M, TILT, s[Q_TURN] * dt * dt)
@@ -85,7 +84,7 @@ def _predict(s: FloatArray, dt: float) -> None:
     kalman.mirror(s, P, M)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _correct(s: FloatArray, r: int) -> None:
     """Level by the accelerometer and take the bias from a rest, where the sample at ``r`` allows."""
     if s[r + R_STILL] < 0.5:
@@ -111,7 +110,7 @@ def _correct(s: FloatArray, r: int) -> None:
         s[BIAS_GYR + i] -= s[DX + BIAS + i]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _advance(s: FloatArray, r: int) -> None:
     strapdown.resolve(s, r)
     x, y, z = s[ACC_N], s[ACC_N + 1], s[ACC_N + 2]
@@ -124,7 +123,7 @@ def _advance(s: FloatArray, r: int) -> None:
     strapdown.move(s, s[r + R_DT])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _navigate(s: FloatArray, out: FloatArray) -> None:
     r = foot.release(s)
     if not foot.starts(s) and s[STARTED] > 0.5:
@@ -140,7 +139,7 @@ def _navigate(s: FloatArray, out: FloatArray) -> None:
     foot.emit_detector(s, r, base.FIRST_DETECTOR, out)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
     """Take one row; fill ``out`` and return True where a result is due."""
     if not foot.take(state, row):
@@ -149,7 +148,7 @@ def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
     """Take all rows; see :class:`.contract.KernelEstimator`."""
     results = 0
@@ -161,7 +160,7 @@ def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
     return results
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def flush(state: FloatArray, out: FloatArray) -> int:
     """Fill ``out`` with the results still held back, return their number."""
     results = 0

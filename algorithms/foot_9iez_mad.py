@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, ClassVar
 
-from numba import njit
-
 from . import foot, strapdown
 from . import foot_9iez as base
 from . import layout as la
+from .compiled import compiled
 from .contract import FloatArray
 from .layout import ACC_N, BIAS_GYR, R_ACC, R_DT, R_GYR, R_STILL, ROT, STARTED
 from .parameters import meta
@@ -43,7 +42,7 @@ class Foot9IezMadParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=
     ] = False
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def madgwick(
     s: FloatArray,
     q: int,
@@ -91,7 +90,7 @@ def madgwick(
     s[q], s[q + 1], s[q + 2], s[q + 3] = a / norm, b / norm, c / norm, d / norm
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _advance(s: FloatArray, r: int) -> None:
     strapdown.resolve(s, r)
     x, y, z = s[ACC_N], s[ACC_N + 1], s[ACC_N + 2]
@@ -113,7 +112,7 @@ def _advance(s: FloatArray, r: int) -> None:
     strapdown.move(s, s[r + R_DT])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _navigate(s: FloatArray, out: FloatArray) -> None:
     r = foot.release(s)
     if foot.starts(s):
@@ -130,7 +129,7 @@ def _navigate(s: FloatArray, out: FloatArray) -> None:
     foot.emit_detector(s, r, base.FIRST_DETECTOR, out)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
     """Take one row; fill ``out`` and return True where a result is due."""
     if not foot.take(state, row):
@@ -139,7 +138,7 @@ def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
     """Take all rows; see :class:`.contract.KernelEstimator`."""
     results = 0
@@ -151,7 +150,7 @@ def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
     return results
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def flush(state: FloatArray, out: FloatArray) -> int:
     """Fill ``out`` with the results still held back, return their number."""
     results = 0

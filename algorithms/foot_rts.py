@@ -11,6 +11,7 @@ from numba import njit
 from . import foot, kalman, strapdown
 from . import foot_15iez_zaru as base
 from . import layout as la
+from .compiled import compiled
 from .contract import AlgorithmError, FloatArray
 from .foot_15iez_zaru import ATT, BACC, BGYR, DX, WORK, XPOS, XVEL, N, P
 from .layout import (
@@ -47,7 +48,7 @@ L_P = _take(N * N)  # covariance after the updates
 LOG = _take.size
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _update(s: FloatArray, log: FloatArray, index: int, seen: float, variance: float) -> None:
     at = L_UPDATE + int(log[L_UPDATES]) * (3 + N)
     log[L_UPDATES] += 1.0
@@ -59,7 +60,7 @@ def _update(s: FloatArray, log: FloatArray, index: int, seen: float, variance: f
         log[at + 3 + i] = s[WORK + i]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _correct(s: FloatArray, r: int, log: FloatArray) -> None:
     """Do what :func:`.foot_15iez_zaru.correct` does, and note every update."""
     kalman.clear(s, DX, N)
@@ -71,7 +72,7 @@ def _correct(s: FloatArray, r: int, log: FloatArray) -> None:
     base.feed_back(s)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _navigate(s: FloatArray, out: FloatArray, log: FloatArray) -> None:
     r = foot.release(s)
     log[L_ACTIVE] = 0.0
@@ -96,7 +97,7 @@ def _navigate(s: FloatArray, out: FloatArray, log: FloatArray) -> None:
     foot.emit_detector(s, r, base.base.FIRST_DETECTOR, out)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def forward(s: FloatArray, rows: FloatArray, out: FloatArray, logs: FloatArray) -> int:
     """Filter until ``out`` is full or the rows have ended; note each sample in ``logs``; return how many."""
     done = 0
@@ -112,7 +113,7 @@ def forward(s: FloatArray, rows: FloatArray, out: FloatArray, logs: FloatArray) 
     return done
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _step_back(a: FloatArray, at: int, stride: int, log: FloatArray) -> None:
     """Multiply the vector at ``a[at + i stride]`` by Fᵀ of the sample in ``log``, in place."""
     dt = log[L_DT]
@@ -200,7 +201,7 @@ def backward(logs: FloatArray, out: FloatArray, adjoint: FloatArray, information
                 _step_back(information, i * N, 1, log)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def steps_again(s: FloatArray, rows: FloatArray, out: FloatArray) -> None:
     """Find the steps anew on the smoothed track; ``s`` is a fresh state."""
     r = int(s[la.RING])

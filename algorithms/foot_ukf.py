@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, ClassVar
 
-from numba import njit
-
 from . import foot, kalman, strapdown
 from . import foot_9iez as base
 from . import layout as la
+from .compiled import compiled
 from .contract import FloatArray
 from .foot_9iez import ATT, XPOS, XVEL, N, P
 from .layout import ACC_OLD, GRAVITY, POS, R_DT, R_STILL, STARTED, TRAPEZOID, VEL
@@ -49,7 +48,7 @@ class FootUkfParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=True
     ] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def semidefinite_root(s: FloatArray, p: int, root: int, n: int) -> None:
     """Write the lower L with L Lᵀ = the n×n matrix at ``s[p]`` to ``s[root]``.
 
@@ -74,7 +73,7 @@ def semidefinite_root(s: FloatArray, p: int, root: int, n: int) -> None:
             s[root + i * n + j] = value / pivot
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _spread(s: FloatArray, d: int, dt: float) -> None:
     """Carry one deviation from the nominal navigation, at ``s[d]``, over the time step, without linearizing.
 
@@ -103,7 +102,7 @@ def _spread(s: FloatArray, d: int, dt: float) -> None:
         s[d + XPOS + i] += (0.5 * (old + new) if s[TRAPEZOID] > 0.5 else new) * dt
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def predict(s: FloatArray, dt: float) -> None:
     """Carry P, and the second-order part of the mean, over one time step by the unscented transform.
 
@@ -140,7 +139,7 @@ def predict(s: FloatArray, dt: float) -> None:
     kalman.mirror(s, P, N)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _navigate(s: FloatArray, out: FloatArray) -> None:
     r = foot.release(s)
     if not foot.starts(s) and s[STARTED] > 0.5:
@@ -161,7 +160,7 @@ def _navigate(s: FloatArray, out: FloatArray) -> None:
     foot.emit_detector(s, r, base.FIRST_DETECTOR, out)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
     """Take one row; fill ``out`` and return True where a result is due."""
     if not foot.take(state, row):
@@ -170,7 +169,7 @@ def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
     """Take all rows; see :class:`.contract.KernelEstimator`."""
     results = 0
@@ -182,7 +181,7 @@ def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
     return results
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def flush(state: FloatArray, out: FloatArray) -> int:
     """Fill ``out`` with the results still held back, return their number."""
     results = 0

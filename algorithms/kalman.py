@@ -8,13 +8,14 @@ bits.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from .compiled import inlined
 
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def update(
     s: FloatArray,
     p: int,
@@ -42,7 +43,7 @@ def update(
     joseph(s, p, n, work, index, total)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def joseph(s: FloatArray, p: int, n: int, work: int, index: int, total: float) -> None:
     """Update the covariance for any gain K at ``s[work]`` on a measurement h = e_index; ``total`` = hᵀ P h +
     r.
@@ -62,7 +63,7 @@ def joseph(s: FloatArray, p: int, n: int, work: int, index: int, total: float) -
     mirror(s, p, n)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def mirror(s: FloatArray, p: int, n: int) -> None:
     """Copy the upper triangle of the n×n matrix at ``s[p]`` to the lower one."""
     for i in range(1, n):
@@ -70,7 +71,7 @@ def mirror(s: FloatArray, p: int, n: int) -> None:
             s[p + i * n + j] = s[p + j * n + i]
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def predict_motion(
     s: FloatArray, p: int, n: int, att: int, pos: int, vel: int, force: int, dt: float
 ) -> None:
@@ -105,7 +106,7 @@ def predict_motion(
         s[c + 2] += y * u - x * v
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def predict_bias(s: FloatArray, p: int, n: int, to: int, bias: int, rot: int, dt: float) -> None:
     """Carry the covariance at ``s[p]`` over ``dt`` by δ_to += −C Δt δ_bias, with C = rot_nb at ``s[rot]``.
 
@@ -126,14 +127,14 @@ def predict_bias(s: FloatArray, p: int, n: int, to: int, bias: int, rot: int, dt
             s[a + i] -= dt * (s[rot + 3 * i] * u + s[rot + 3 * i + 1] * v + s[rot + 3 * i + 2] * w)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def add_noise(s: FloatArray, p: int, n: int, first: int, variance: float) -> None:
     """Add ``variance`` to the three diagonal entries from state ``first`` on."""
     for i in range(first, first + 3):
         s[p + i * (n + 1)] += variance
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@inlined
 def clear(s: FloatArray, first: int, count: int) -> None:
     """Set ``count`` entries from ``first`` on to zero."""
     for i in range(first, first + count):

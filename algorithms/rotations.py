@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from .compiled import compiled
 
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def rot_from_rpy(s: FloatArray, at: int, roll: float, pitch: float, yaw: float) -> None:
     """Write ``Rz(yaw) Ry(pitch) Rx(roll)`` (rad) to ``s[at:at+9]``."""
     cr, sr = math.cos(roll), math.sin(roll)
@@ -33,7 +34,7 @@ def rot_from_rpy(s: FloatArray, at: int, roll: float, pitch: float, yaw: float) 
     s[at + 8] = cp * cr
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def quat_from_rot(s: FloatArray, at: int, out: FloatArray, to: int) -> None:
     """Write the unit quaternion (wxyz, w ≥ 0) of the rotation at ``s[at:at+9]`` to ``out[to:to+4]``.
 
@@ -70,7 +71,7 @@ def quat_from_rot(s: FloatArray, at: int, out: FloatArray, to: int) -> None:
     out[to + 3] = z * scale
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def rot_from_quat(q: FloatArray, at: int, s: FloatArray, to: int) -> None:
     """Write the rotation of the unit quaternion (wxyz) at ``q[at:at+4]`` to ``s[to:to+9]``."""
     w, x, y, z = q[at], q[at + 1], q[at + 2], q[at + 3]
@@ -85,7 +86,7 @@ def rot_from_quat(q: FloatArray, at: int, s: FloatArray, to: int) -> None:
     s[to + 8] = 1.0 - 2.0 * (x * x + y * y)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def turn_body(s: FloatArray, at: int, x: float, y: float, z: float) -> None:
     """Multiply the rotation at ``s[at:at+9]`` from the right by ``(2I + [θ]×)(2I − [θ]×)⁻¹``, θ = (x, y, z)
     in rad.
@@ -111,7 +112,7 @@ def turn_body(s: FloatArray, at: int, x: float, y: float, z: float) -> None:
         s[i + 2] = u * m02 + v * m12 + w * m22
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def turn_nav(s: FloatArray, at: int, x: float, y: float, z: float) -> None:
     """Multiply the rotation at ``s[at:at+9]`` from the left by ``(2I + [θ]×)(2I − [θ]×)⁻¹``, θ = (x, y, z)
     in rad.
@@ -134,7 +135,7 @@ def turn_nav(s: FloatArray, at: int, x: float, y: float, z: float) -> None:
         s[j + 6] = m20 * u + m21 * v + m22 * w
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def orthonormalize(s: FloatArray, at: int) -> None:
     """Take rounding out of a rotation: ``C ← C (3I − CᵀC)/2``, the symmetric correction to first order."""
     c00, c01, c02 = s[at], s[at + 1], s[at + 2]
