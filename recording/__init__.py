@@ -50,7 +50,7 @@ def open(path: Path | str) -> Recording:
     return Recording(path)
 
 
-def create(path: Path | str, *, overwrite: bool = False, level: int = ZSTD_LEVEL) -> Writer:
+def create(path: Path | str, *, overwrite: bool = False, level: int | None = ZSTD_LEVEL) -> Writer:
     """Open a recording for writing; nothing is at ``path`` until the ``with`` block ends well.
 
     Parameters
@@ -59,9 +59,9 @@ def create(path: Path | str, *, overwrite: bool = False, level: int = ZSTD_LEVEL
         The recording.
     overwrite : bool
         Whether it may be replaced.
-    level : int
-        Compression level of zstd. The default suits raw readings; level 1 takes less than half the time and
-        gives the same size for computed numbers, whose low bits are noise.
+    level : int or None
+        Compression level of zstd; None does not compress. The default suits raw readings; computed numbers,
+        whose low bits are noise, lose little by being compressed.
 
     Raises
     ------

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import os
+from concurrent.futures import Future
 from pathlib import Path
 
 from .errors import MarchaError, OutputExists, UsageError
+from .threads import helpers
+
+SYNC_BYTES = 1 << 26
+"""So many bytes go to disk together, while more are being written."""
 
 
 class AtomicFile:
@@ -31,6 +36,8 @@ class AtomicFile:
         self.path = path
         self.overwrite = overwrite
         self._done = False
+        self._waiting = 0
+        self._syncing: Future[None] | None = None
         if path.is_dir():
             raise UsageError(f"{path}: is a folder; name a file")
         if path.exists() and not overwrite:
@@ -50,7 +57,7 @@ class AtomicFile:
         _lock(self._file.fileno())
 
     def write(self, data: bytes | memoryview) -> None:
-        """Append bytes.
+        """Append bytes; what has come together goes to disk in the background.
 
         Raises
         ------
@@ -59,9 +66,23 @@ class AtomicFile:
         """
         try:
             self._file.write(data)
+            self._waiting += len(data)
+            if self._waiting >= SYNC_BYTES:
+                self._sync_behind()
         except OSError as e:
             self.abort()
             raise _failure(self.path, e) from None
+
+    def _sync_behind(self) -> None:
+        """Send to disk what was written, in a thread: nobody should wait for all of it at the end."""
+        if self._syncing is None:
+            self._pool = helpers("sync", 1)
+        elif not self._syncing.done():
+            return
+        else:
+            self._syncing.result()
+        self._waiting = 0
+        self._syncing = self._pool.submit(os.fsync, self._file.fileno())
 
     def commit(self) -> None:
         """Flush to disk and put the file in its place.
@@ -74,6 +95,9 @@ class AtomicFile:
             The disk is full or failed; nothing is left.
         """
         try:
+            if self._syncing is not None:
+                self._syncing.result()
+                self._pool.shutdown()
             self._file.flush()
             os.fsync(self._file.fileno())
             if self.overwrite:
@@ -95,6 +119,8 @@ class AtomicFile:
         if self._done:
             return
         self._done = True
+        if self._syncing is not None:
+            self._pool.shutdown()
         with contextlib.suppress(OSError):  # close() flushes, and the disk may be full
             self._file.close()
         self.part.unlink(missing_ok=True)

@@ -225,6 +225,10 @@ class McapFile:
 
 
 _local = threading.local()
+_LENGTH = struct.Struct("<Q")
+_RECORD_HEAD = 9
+"""Bytes of opcode and length before every record."""
+_INDEX_HEAD = struct.Struct("<BQHI")
 
 
 def _compressor(level: int) -> zstandard.ZstdCompressor:
@@ -241,7 +245,7 @@ def pack(
     channel_id: int,
     log: NDArray[np.int64],
     offsets: NDArray[np.int64],
-    level: int = ZSTD_LEVEL,
+    level: int | None = ZSTD_LEVEL,
 ) -> Packed:
     """Compress message records of one channel into a chunk and build its message index.
 
@@ -253,22 +257,29 @@ def pack(
         Their channel.
     log, offsets : ndarray of int64, shape (n,)
         Log time and first byte of every record.
-    level : int
-        Compression level of zstd.
+    level : int or None
+        Compression level of zstd; None does not compress.
     """
     raw = data.data
-    compressed = _compressor(level).compress(raw)
+    compression, body = ("", raw) if level is None else ("zstd", _compressor(level).compress(raw))
     first, last = int(log.min()), int(log.max())
     chunk = RecordBuilder()
-    Chunk("zstd", compressed, last, first, crc32(raw), data.size).write(chunk)
+    Chunk(compression, b"", last, first, crc32(raw), data.size).write(chunk)
+    # The records' own builder would copy these megabytes three times, and loop over tuples for the index.
+    head = bytearray(chunk.end())
+    _LENGTH.pack_into(head, 1, len(head) - _RECORD_HEAD + len(body))
+    _LENGTH.pack_into(head, len(head) - _LENGTH.size, len(body))
     entries = np.empty((len(log), 2), "<u8")
     entries[:, 0] = log
     entries[:, 1] = offsets
-    index = RecordBuilder()  # MessageIndex.write would loop over tuples
-    index.start_record(Opcode.MESSAGE_INDEX)
-    index.write2(channel_id)
-    index.write4(entries.nbytes)
-    index.write(entries.tobytes())
-    index.finish_record()
-    channels = {channel_id: (0, len(log))}
-    return Packed(chunk.end(), index.end(), channels, first, last, "zstd", len(compressed), data.size)
+    index_head = _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + entries.nbytes, channel_id, entries.nbytes)
+    return Packed(
+        b"".join((head, body)),
+        b"".join((index_head, entries.data)),
+        {channel_id: (0, len(log))},
+        first,
+        last,
+        compression,
+        len(body),
+        data.size,
+    )

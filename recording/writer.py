@@ -65,7 +65,7 @@ class Writer:
     :func:`marcha.recording.create`.
     """
 
-    def __init__(self, path: Path | str, *, overwrite: bool = False, level: int = ZSTD_LEVEL) -> None:
+    def __init__(self, path: Path | str, *, overwrite: bool = False, level: int | None = ZSTD_LEVEL) -> None:
         self.path = Path(path)
         self._level = level
         self._file = McapFile(self.path, overwrite=overwrite)
@@ -134,7 +134,7 @@ class Writer:
         self,
         topic: str,
         schema: str,
-        table: pl.DataFrame,
+        table: pl.DataFrame | Mapping[str, NDArray[Any]],
         frame_id: str = "",
         metadata: Mapping[str, str] | None = None,
     ) -> None:
@@ -144,8 +144,9 @@ class Writer:
         ----------
         topic, schema, frame_id, metadata
             See :meth:`add_channel`; ``metadata`` and ``frame_id`` count at the first call.
-        table : polars.DataFrame
-            ``t_ns`` (Int64), optional ``t_log_ns`` (Int64, default ``t_ns``), and columns of the type.
+        table : polars.DataFrame, or mapping of str to ndarray
+            ``t_ns`` (Int64), optional ``t_log_ns`` (Int64, default ``t_ns``), and columns of the type. Arrays
+            of one length do as well; they must not be written to afterwards.
 
         Raises
         ------
@@ -163,7 +164,8 @@ class Writer:
             raise UsageError(f"{where}: {schema} into a channel of {out.schema}")
         if frame_id and out.frame_id != frame_id:
             raise UsageError(f"{where}: frame_id {frame_id!r}, the channel has {out.frame_id!r}")
-        columns = tuple(c for c in table.columns if c not in ("t_ns", "t_log_ns"))
+        given = {s.name: s for s in table.get_columns()} if isinstance(table, pl.DataFrame) else dict(table)
+        columns = tuple(c for c in given if c not in ("t_ns", "t_log_ns"))
         if out.encoder is None:
             self._declare(out, columns)
         assert out.encoder is not None
@@ -172,19 +174,22 @@ class Writer:
             raise MarchaError(
                 f"{where}: every table of a channel has the same columns; missing or unknown: {odd}"
             )
-        t_ns = self._times(table, "t_ns", where)
-        log = self._times(table, "t_log_ns", where) if "t_log_ns" in table.columns else t_ns
+        t_ns = self._times(given, "t_ns", where)
+        log = self._times(given, "t_log_ns", where) if "t_log_ns" in given else t_ns
+        if any(len(values) != len(t_ns) for values in given.values()):
+            lengths = {name: len(values) for name, values in given.items()}
+            raise MarchaError(f"{where}: columns of different lengths: {lengths}")
         if len(log) == 0:
             return
-        steps = np.diff(log, prepend=out.last_log)
-        if (steps < 0).any():
-            bad = int(np.argmax(steps < 0))
+        if log[0] < out.last_log or (log[1:] < log[:-1]).any():
+            before = np.concatenate(([out.last_log], log[:-1]))
+            bad = int(np.argmax(log < before))
             raise MarchaError(
-                f"{where}: row {bad}: log time {log[bad]} ns is before the previous row's "
-                f"{log[bad] - steps[bad]}; sort the rows by log time"
+                f"{where}: row {bad}: log time {log[bad]} ns is before the previous row's {before[bad]}; "
+                "sort the rows by log time"
             )
         try:
-            arrays = out.encoder.arrays(table)
+            arrays = out.encoder.arrays(given)
         except MarchaError as e:
             raise MarchaError(f"{self.path}: {e}") from None
         out.last_log = int(log[-1])
@@ -308,10 +313,15 @@ class Writer:
         schema = self._file.add_schema(out.schema, "ros2msg", full_text(out.schema).encode())
         self._file.add_channel(Channel(out.id, out.topic, "cdr", metadata, schema))
 
-    def _times(self, table: pl.DataFrame, name: str, where: str) -> NDArray[np.int64]:
-        if name not in table.columns or table.schema[name] != pl.Int64 or table[name].null_count():
+    def _times(
+        self, given: Mapping[str, pl.Series | NDArray[Any]], name: str, where: str
+    ) -> NDArray[np.int64]:
+        values = given.get(name)
+        if isinstance(values, pl.Series) and values.dtype == pl.Int64 and not values.null_count():
+            values = values.to_numpy()
+        if not isinstance(values, np.ndarray) or values.dtype != np.int64:
             raise MarchaError(f"{where}: column {name!r} must be there, Int64, without nulls")
-        return check_times(table[name].to_numpy(), f"{where}: {name}")
+        return check_times(values, f"{where}: {name}")
 
     def _buffer(self, out: _Output, encoder: Encoder, block: dict[str, NDArray[Any]]) -> None:
         """Cut rows into chunks; keep less than a chunk for the next call."""
@@ -361,7 +371,7 @@ class Writer:
                 self._file.submit(pack_records, batch, id_)
 
 
-def _lay(encoder: Encoder, block: dict[str, NDArray[Any]], sequence: int, level: int) -> Packed:
+def _lay(encoder: Encoder, block: dict[str, NDArray[Any]], sequence: int, level: int | None) -> Packed:
     """Lay one block of rows into a chunk; runs in a worker thread."""
     data, offsets = encoder.encode(block, block["t_ns"], block["t_log_ns"], sequence)
     return pack(data, encoder.channel_id, block["t_log_ns"], offsets, level)

@@ -15,6 +15,7 @@ import polars as pl
 from ..recording.errors import Finding, UsageError
 from ..recording.provenance import environment
 from ..recording.threads import ahead
+from .blocks import Block
 from .clock import Clock, SystemClock
 from .feed import Feed, GapPolicy, Merged
 from .plan import Plan, PlannedRun
@@ -373,7 +374,7 @@ class Engine:
         part = merged.part(self._cursor, last)
         for topic, table in part.tables.items():
             if topic in self._raw_topics:
-                self._emit(topic, table, raw=True)
+                self._emit(topic, Block(table), raw=True)
         rows = {id(f): f.take(part) for f in self._feeds}
         for runner in self.runners:
             ready = rows[id(runner.feed)]
@@ -392,21 +393,26 @@ class Engine:
             begin, end = self._begin_ns, self._end_ns if self._end_ns is not None else self.source.end_ns
             self._progress(min(newest, end) - begin if end > begin else newest, max(0, end - begin))
 
-    def _emit_all(self, runner: Runner, tables: dict[str, pl.DataFrame]) -> None:
-        for name, table in tables.items():
-            self._emit(runner.plan.outputs[name].topic, table)
+    def _emit_all(self, runner: Runner, blocks: dict[str, Block]) -> None:
+        for name, block in blocks.items():
+            self._emit(runner.plan.outputs[name].topic, block)
 
-    def _emit(self, topic: str, table: pl.DataFrame, raw: bool = False) -> None:
+    def _emit(self, topic: str, block: Block, raw: bool = False) -> None:
         before = self._written.get(topic, 0)
-        after = self._written[topic] = before + table.height
+        after = self._written[topic] = before + len(block)
         known = self._seen.get(topic, 0)
         self._seen[topic] = max(known, after)
         for sink in self.sinks:
             if raw and not getattr(sink, "raw", True):
                 continue
-            fresh = table if hasattr(sink, "rewind") or known <= before else table[known - before :]
-            if fresh.height:
-                sink.write(topic, fresh)
+            fresh = block if hasattr(sink, "rewind") else block.since(max(0, known - before))
+            if not len(fresh):
+                continue
+            write_block = getattr(sink, "write_block", None)
+            if write_block is not None:
+                write_block(topic, fresh)
+            else:
+                sink.write(topic, fresh.table)
 
     # -- going back ----------------------------------------------------------------------------------
 

@@ -8,14 +8,17 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
-import msgspec
 import numpy as np
 import polars as pl
 
 from ..algorithms.contract import FloatArray, KernelEstimator, input_columns, output_columns
 from ..recording.errors import Finding, MarchaError
+from .blocks import Block, Columns, joined
 from .feed import Feed, IntArray, Rows
 from .plan import PlannedRun
+
+STRETCH = 4096
+"""Rows whose results are turned from rows to columns together: they stay in the processor's cache."""
 
 
 @dataclass
@@ -53,11 +56,11 @@ class Runner:
         self.blocks = blocks and not plan.offline and hasattr(self.estimator, "run_block")
         self.loop_s = 0.0
         self._stance: list[tuple[int, int]] = []
-        self._steps: list[tuple[int, int, dict[str, str]]] = []
+        self._steps: list[pl.DataFrame] = []
         self._state = _State()
         self._compile()
         self._fresh = self._estimator_snapshot()
-        self._out = np.empty((0, len(self.columns)))
+        self._out: FloatArray | None = None
         self._rows: list[tuple[FloatArray, IntArray]] = []  # of an offline estimator, the present segment
 
     def _compile(self) -> None:
@@ -106,72 +109,83 @@ class Runner:
         del self._stance[stances:], self._steps[steps:]
         self._rows = list(rows)
 
-    # -- rows in, tables out -------------------------------------------------------------------------
+    # -- rows in, blocks out -------------------------------------------------------------------------
 
-    def take(self, rows: Rows) -> dict[str, pl.DataFrame]:
-        """Feed rows; return a table of every output that has something to say."""
-        tables: list[dict[str, pl.DataFrame]] = []
+    def take(self, rows: Rows) -> dict[str, Block]:
+        """Feed rows; return a block of every output that has something to say."""
+        blocks: list[dict[str, Block]] = []
         bounds = [0, *rows.resets, len(rows)]
         for k, (a, b) in enumerate(pairwise(bounds)):
             if k and self._state.samples:
-                tables.append(self._restart())
+                blocks.append(self._restart())
             if b > a:
-                tables.append(self._segment(rows.values[a:b], rows.t_ns[a:b], rows.t_log_ns[a:b]))
-        return _joined(tables)
+                blocks.append(self._segment(rows.values[a:b], rows.t_ns[a:b], rows.t_log_ns[a:b]))
+        if len(blocks) == 1:
+            return blocks[0]
+        names = dict.fromkeys(n for given in blocks for n in given)
+        return {n: joined([given[n] for given in blocks if n in given]) for n in names}
 
-    def finish(self, end_ns: int) -> dict[str, pl.DataFrame]:
+    def finish(self, end_ns: int) -> dict[str, Block]:
         """Return the results that the estimator still holds; ``end_ns`` is the log time of an offline one."""
         if self.plan.offline:
             self._state.last_log_ns = max(self._state.last_log_ns, end_ns)
-        tables = self._flush()
+        blocks = self._flush()
         self._close_stance()
-        return tables
+        return blocks
 
-    def _restart(self) -> dict[str, pl.DataFrame]:
-        tables = self._flush()
+    def _restart(self) -> dict[str, Block]:
+        blocks = self._flush()
         self._close_stance()
         self._restore_estimator(self._fresh)
         self._state.recent_ns = np.empty(0, np.int64)
-        return tables
+        return blocks
 
-    def _segment(self, values: FloatArray, t_ns: IntArray, t_log_ns: IntArray) -> dict[str, pl.DataFrame]:
+    def _segment(self, values: FloatArray, t_ns: IntArray, t_log_ns: IntArray) -> dict[str, Block]:
         state = self._state
         state.samples += len(t_ns)
         state.last_log_ns = int(t_log_ns[-1])
         if self.plan.offline:
             self._rows.append((values, t_ns))
             return {}
-        if len(self._out) < len(t_ns):
-            self._out = np.empty((len(t_ns), len(self.columns)))
-        out = self._out[: len(t_ns)]  # fresh memory for every block would cost as much as the estimator
-        out.fill(np.nan)
-        begin = time.perf_counter()
-        if self.blocks:
-            self.estimator.run_block(values, out)
-        else:
-            step = self.estimator.step
-            for i, row in enumerate(values):
-                result = step(row)
-                if result is not None:
-                    out[i] = result
-        self.loop_s += time.perf_counter() - begin
+        columns = np.empty((len(self.columns), len(t_ns)))
+        for a in range(0, len(t_ns), STRETCH):
+            part = values[a : a + STRETCH]
+            columns[:, a : a + STRETCH] = self._results(part).T
         times = t_ns
         if self.latency:
             known = np.concatenate((state.recent_ns, t_ns))
             state.recent_ns = known[-self.latency :]
             early = self.latency - (len(known) - len(t_ns))  # rows whose result would speak of none
             if early > 0:
-                if not np.isnan(out[:early]).all():
+                if not np.isnan(columns[:, :early]).all():
                     raise MarchaError(
                         f"estimator {self.plan.name} gave a result within its first {self.latency} rows, "
                         f"its declared latency: the result would have no time"
                     )
-                out, t_log_ns = out[early:], t_log_ns[early:]
+                columns, t_log_ns = columns[:, early:], t_log_ns[early:]
             times = known[: len(known) - self.latency] if len(known) > self.latency else known[:0]
-            times = times[len(times) - len(out) :]
-        return self._tables(out, times, t_log_ns)
+            times = times[len(times) - columns.shape[1] :]
+        return self._blocks(columns, times, t_log_ns)
 
-    def _flush(self) -> dict[str, pl.DataFrame]:
+    def _results(self, rows: FloatArray) -> FloatArray:
+        """Return the result of every row, NaN where there is none; valid until the next call."""
+        if self._out is None:
+            self._out = np.empty((STRETCH, len(self.columns)))
+        out = self._out[: len(rows)]
+        out.fill(np.nan)
+        begin = time.perf_counter()
+        if self.blocks:
+            self.estimator.run_block(rows, out)
+        else:
+            step = self.estimator.step
+            for i, row in enumerate(rows):
+                result = step(row)
+                if result is not None:
+                    out[i] = result
+        self.loop_s += time.perf_counter() - begin
+        return out
+
+    def _flush(self) -> dict[str, Block]:
         state = self._state
         if self.plan.offline:
             if not self._rows:
@@ -192,33 +206,32 @@ class Runner:
                 f"estimator {self.plan.name} returned {out.shape} at its end, "
                 f"expected ({len(times)}, {len(self.columns)})"
             )
-        return self._tables(out, times, np.full(len(times), state.last_log_ns))
+        return self._blocks(np.ascontiguousarray(out.T), times, np.full(len(times), state.last_log_ns))
 
-    def _tables(self, out: FloatArray, t_ns: IntArray, t_log_ns: IntArray) -> dict[str, pl.DataFrame]:
-        tables: dict[str, pl.DataFrame] = {}
-        columns = out.T.copy()  # the block's memory is used again
+    def _blocks(self, columns: FloatArray, t_ns: IntArray, t_log_ns: IntArray) -> dict[str, Block]:
+        """Return a block an output; ``columns`` is (columns, rows)."""
+        blocks: dict[str, Block] = {}
         first = 0
         for output in self.estimator.outputs:
-            block = columns[first : first + len(output.columns)]
+            part = columns[first : first + len(output.columns)]
             first += len(output.columns)
-            spoken = ~np.isnan(block[0])
+            spoken = ~np.isnan(part[0])
             if not output.event and not spoken.all():
-                spoken = ~np.isnan(block).all(axis=0)
+                spoken = ~np.isnan(part).all(axis=0)
             if not spoken.any():
                 continue
-            all_of_it = bool(spoken.all())
-            pick = slice(None) if all_of_it else spoken
-            data: dict[str, Any] = {"t_ns": t_ns[pick], "t_log_ns": t_log_ns[pick]}
-            data |= {name: block[i][pick] for i, name in enumerate(output.columns)}
+            pick = slice(None) if spoken.all() else spoken
+            data: Columns = {"t_ns": t_ns[pick], "t_log_ns": t_log_ns[pick]}
+            data |= {name: part[i][pick] for i, name in enumerate(output.columns)}
             if output.schema == "marcha_msgs/msg/Stance":
                 data["still"] = data["still"] > 0.5
                 self._note_stances(data["t_ns"], data["still"])
-            table = pl.DataFrame(data)
+            block = Block(data)
             if output.schema == "marcha_msgs/msg/Step":
-                table = _with_swing_times(table)
-                self._note_steps(table)
-            tables[output.name] = table
-        return tables
+                block = Block(_with_swing_times(block.table))
+                self._steps.append(block.table)
+            blocks[output.name] = block
+        return blocks
 
     # -- annotations ---------------------------------------------------------------------------------
 
@@ -242,20 +255,19 @@ class Runner:
             self._stance.append((state.still_since, state.still_until))
             state.still_since = None
 
-    def _note_steps(self, table: pl.DataFrame) -> None:
-        about = [c for c in table.columns if c not in ("t_ns", "t_log_ns", "start_ns", "end_ns")]
-        for row in table.iter_rows(named=True):
-            values = {c: f"{row[c]:.6g}" for c in about}
-            self._steps.append((int(row["start_ns"]), int(row["end_ns"]), values))
-
     def annotation_table(self) -> pl.DataFrame:
         """Return stances and steps as annotations of the tiers ``<run>/stance`` and ``<run>/step``."""
         run = self.plan.run
-        rows = [(f"{run}/stance", a, b, "stance", {}) for a, b in self._stance]
-        rows += [
-            (f"{run}/step", a, b, f"step {v.get('index', i)}", v) for i, (a, b, v) in enumerate(self._steps)
-        ]
-        return annotation_frame(rows)
+        bounds = np.array(self._stance, np.int64).reshape(-1, 2)
+        stances = pl.DataFrame({"start_ns": bounds[:, 0], "end_ns": bounds[:, 1]}).select(
+            pl.lit(f"{run}/stance").alias("tier"),
+            "start_ns",
+            "end_ns",
+            pl.lit("stance").alias("label"),
+            pl.lit("{}").alias("metadata"),
+        )
+        tables = [stances, *([_step_annotations(pl.concat(self._steps), run)] if self._steps else [])]
+        return pl.concat(tables).sort("start_ns", maintain_order=True)
 
     # -- what to say -----------------------------------------------------------------------------------
 
@@ -286,20 +298,19 @@ class Runner:
         return found, fatal
 
 
-ANNOTATION_SCHEMA = {
-    "tier": pl.String,
-    "start_ns": pl.Int64,
-    "end_ns": pl.Int64,
-    "label": pl.String,
-    "metadata": pl.String,
-}
-
-
-def annotation_frame(rows: list[tuple[str, int, int, str, dict[str, str]]]) -> pl.DataFrame:
-    """Return annotation rows as the table that :meth:`Writer.add_annotations` takes."""
-    return pl.DataFrame(
-        [(*r[:4], msgspec.json.encode(r[4]).decode()) for r in rows], schema=ANNOTATION_SCHEMA, orient="row"
-    ).sort("start_ns", maintain_order=True)
+def _step_annotations(steps: pl.DataFrame, run: str) -> pl.DataFrame:
+    """Return steps as annotations; their numbers, rounded to six digits, are the metadata (JSON text)."""
+    about = sorted(c for c in steps.columns if c not in ("t_ns", "t_log_ns", "start_ns", "end_ns"))
+    texts = [pl.Series(c, [f"{v:.6g}" for v in steps[c].to_list()], dtype=pl.String) for c in about]
+    form = "{{" + ", ".join(f'"{c}": "{{}}"' for c in about) + "}}"
+    number = pl.col("index") if "index" in about else pl.int_range(pl.len())
+    return steps.select(
+        pl.lit(f"{run}/step").alias("tier"),
+        "start_ns",
+        "end_ns",
+        pl.format("step {}", number).alias("label"),
+        pl.format(form, *texts).alias("metadata"),
+    )
 
 
 def _with_swing_times(table: pl.DataFrame) -> pl.DataFrame:
@@ -314,11 +325,3 @@ def _with_swing_times(table: pl.DataFrame) -> pl.DataFrame:
         pl.col("t_ns").alias("end_ns"),
         *(c for c in table.columns[2:] if c != "swing_s"),
     ).with_columns(pl.col("index").cast(pl.UInt32))
-
-
-def _joined(tables: list[dict[str, pl.DataFrame]]) -> dict[str, pl.DataFrame]:
-    """Put the tables of consecutive stretches together, by output."""
-    if len(tables) == 1:
-        return tables[0]
-    names = dict.fromkeys(n for t in tables for n in t)
-    return {n: pl.concat([t[n] for t in tables if n in t]) for n in names}

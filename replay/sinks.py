@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import polars as pl
 
 from ..recording import create
+from .blocks import Block, joined
 from .plan import Plan
 
 if TYPE_CHECKING:
@@ -17,9 +18,9 @@ if TYPE_CHECKING:
     from .engine import ReplayResult
 
 
-LEVEL = -3
-"""Compression of estimates: their low bits are noise. Level 1 takes twice as long for files 7 % smaller,
-level 3 more than three times as long for 8 %."""
+LEVEL = None
+"""Estimates are not compressed: their low bits are noise. zstd −3 would save 40 % and take as long as all the
+rest of a replay in blocks. They can be computed again; a recording exported to be handed on is compressed."""
 
 
 class Sink(Protocol):
@@ -27,7 +28,8 @@ class Sink(Protocol):
 
     A sink may set ``raw = False`` if it does not want the source's own channels, and may have a method
     ``rewind(t_log_ns)``: it is called when the engine seeks back, and what was logged from that time on comes
-    again. A sink without it sees every message once, whatever the engine does.
+    again. A sink without it sees every message once, whatever the engine does. One with a method
+    ``write_block(topic, block)`` is given a :class:`.blocks.Block` instead of a table.
     """
 
     def open(self, plan: Plan) -> None:
@@ -46,42 +48,42 @@ class Sink(Protocol):
 class TableSink:
     """Keeps the tables of all runs in memory.
 
-    Attributes
-    ----------
-    tables : dict of str to list of polars.DataFrame
-        Pieces by topic.
+    :meth:`table` returns one.
     """
 
     raw = False
 
     def __init__(self) -> None:
-        self.tables: dict[str, list[pl.DataFrame]] = {}
+        self._blocks: dict[str, list[Block]] = {}
         self._plan: Plan | None = None
 
     def open(self, plan: Plan) -> None:
         """Start anew."""
         self._plan = plan
-        self.tables = {}
+        self._blocks = {}
 
     def write(self, topic: str, table: pl.DataFrame) -> None:
         """Keep it."""
-        self.tables.setdefault(topic, []).append(table)
+        self.write_block(topic, Block(table))
+
+    def write_block(self, topic: str, block: Block) -> None:
+        """Keep it."""
+        self._blocks.setdefault(topic, []).append(block)
 
     def rewind(self, t_log_ns: int) -> None:
         """Forget what was logged from ``t_log_ns`` on."""
-        for topic, pieces in self.tables.items():
-            self.tables[topic] = [p.filter(pl.col("t_log_ns") < t_log_ns) for p in pieces]
+        for topic, blocks in self._blocks.items():
+            self._blocks[topic] = [Block(b.table.filter(pl.col("t_log_ns") < t_log_ns)) for b in blocks]
 
     def close(self, result: ReplayResult | None) -> None:
         """Nothing to do."""
 
     def table(self, topic: str) -> pl.DataFrame | None:
         """Return all messages of a topic, None where it is not one of a run's."""
-        pieces = self.tables.get(topic, [])
-        if pieces:
-            whole = pl.concat(pieces)
-            self.tables[topic] = [whole]
-            return whole
+        if blocks := self._blocks.get(topic):
+            whole = Block(joined(blocks).table)
+            self._blocks[topic] = [whole]
+            return whole.table
         channel = self._plan.channels.get(topic) if self._plan else None
         if channel is None:
             return None
@@ -109,7 +111,7 @@ class RecordingSink:
         self.raw = recording is None
         self._recording = recording
         self._overwrite = overwrite
-        self._queue: queue.Queue[tuple[str, pl.DataFrame] | ReplayResult | None] = queue.Queue(8)
+        self._queue: queue.Queue[tuple[str, Block] | ReplayResult | None] = queue.Queue(8)
         self._error: BaseException | None = None
         self._thread: threading.Thread | None = None
         self._plan: Plan | None = None
@@ -123,8 +125,12 @@ class RecordingSink:
 
     def write(self, topic: str, table: pl.DataFrame) -> None:
         """Queue a table; raises what went wrong in writing earlier ones."""
+        self.write_block(topic, Block(table))
+
+    def write_block(self, topic: str, block: Block) -> None:
+        """Queue a block; raises what went wrong in writing earlier ones."""
         self._check()
-        self._queue.put((topic, table))
+        self._queue.put((topic, block))
 
     def close(self, result: ReplayResult | None) -> None:
         """Write what is left and the lineage, and put the recording in place; without a result drop it."""
@@ -168,9 +174,9 @@ class RecordingSink:
                         metadata=dict(channel.metadata),
                     )
             while isinstance(item := self._queue.get(), tuple):
-                topic, table = item
+                topic, block = item
                 channel = channels[topic]
-                out.add_table(topic, channel.schema, table, frame_id=channel.frame_id)
+                out.add_table(topic, channel.schema, block.rows, frame_id=channel.frame_id)
             self._ended = True
             if item is None:
                 raise _Dropped

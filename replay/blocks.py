@@ -1,0 +1,52 @@
+"""Results on their way from an estimator to the sinks."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+Columns = dict[str, NDArray[Any]]
+
+
+class Block:
+    """Rows of one topic, as arrays or as a table: whoever needs the other form makes it.
+
+    Parameters
+    ----------
+    rows : dict of str to ndarray, or polars.DataFrame
+        ``t_ns``, ``t_log_ns`` and columns.
+    """
+
+    def __init__(self, rows: Columns | pl.DataFrame) -> None:
+        self.rows = rows
+
+    def __len__(self) -> int:
+        return self.rows.height if isinstance(self.rows, pl.DataFrame) else len(self.rows["t_ns"])
+
+    def since(self, first: int) -> Block:
+        """Return the rows from ``first`` on."""
+        if first == 0:
+            return self
+        if isinstance(self.rows, pl.DataFrame):
+            return Block(self.rows[first:])
+        return Block({name: values[first:] for name, values in self.rows.items()})
+
+    @cached_property
+    def table(self) -> pl.DataFrame:
+        """The rows as a table."""
+        return self.rows if isinstance(self.rows, pl.DataFrame) else pl.DataFrame(self.rows)
+
+
+def joined(blocks: list[Block]) -> Block:
+    """Return the blocks of one topic as one; at least one."""
+    if len(blocks) == 1:
+        return blocks[0]
+    parts = [b.rows for b in blocks]
+    arrays = [p for p in parts if not isinstance(p, pl.DataFrame)]
+    if len(arrays) == len(parts):
+        return Block({name: np.concatenate([p[name] for p in arrays]) for name in arrays[0]})
+    return Block(pl.concat([b.table for b in blocks]))
