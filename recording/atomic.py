@@ -47,7 +47,7 @@ class AtomicFile:
         number = 0
         while True:
             try:
-                self._file = self.part.open("xb", buffering=1 << 20)
+                self._file = self.part.open("xb", buffering=1 << 16)
                 break
             except FileExistsError:  # a second writer of the same process
                 number += 1

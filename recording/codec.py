@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -156,7 +155,7 @@ class Encoder:
             constants = group.present if group in groups else group.absent
             self._constants |= {self._root + k: v for k, v in constants.items()}
         self._text_bindings = [b for b in self.bindings if b.kind == "text"]
-        self._local = threading.local()
+        self._free: list[Bytes] = []
         self._cache: dict[tuple[bytes, ...], tuple[np.dtype[Any], Bytes]] = {}
         self.record_size = self._plan(tuple(b"" for _ in self._text_bindings))[1].size
 
@@ -207,15 +206,17 @@ class Encoder:
         Returns
         -------
         data : ndarray of uint8
-            The records, one behind the other; valid until this thread's next call.
+            The records, one behind the other. :meth:`release` takes the memory back.
         offsets : ndarray of int64, shape (n,)
             Where each record starts in ``data``.
         """
         n = len(t_ns)
         if not self._text_bindings:
             data = self._blank_records(n)
-            self._fill(data, self._plan(())[0], columns, t_ns, t_log_ns, np.arange(sequence, sequence + n))
-            return data.reshape(-1), np.arange(n, dtype=np.int64) * data.shape[1]
+            self._fill(
+                data[:n], self._plan(())[0], columns, t_ns, t_log_ns, np.arange(sequence, sequence + n)
+            )
+            return data[:n].reshape(-1), np.arange(n, dtype=np.int64) * data.shape[1]
         texts = list(zip(*(columns[b.column] for b in self._text_bindings), strict=True))
         records: list[bytes] = [b""] * n
         numbers = np.arange(sequence, sequence + n)
@@ -233,11 +234,25 @@ class Encoder:
         return np.frombuffer(b"".join(records), "u1"), np.cumsum(sizes) - sizes
 
     def _blank_records(self, n: int) -> Bytes:
-        """Return ``n`` records with all that is constant in them, in memory that this thread uses again."""
-        data = getattr(self._local, "data", None)
+        """Return at least ``n`` records with all that is constant in them, in memory that is used again.
+
+        Fresh memory for every chunk would cost as much as filling it.
+        """
+        try:
+            data = self._free.pop()
+        except IndexError:
+            data = None
         if data is None or len(data) < n:
-            data = self._local.data = np.tile(self._plan(())[1], (n, 1))
-        return data[:n]
+            template = self._plan(())[1]
+            data = np.empty((n, template.size), "u1")  # owns its memory: release finds it again
+            data[:] = template
+        return data
+
+    def release(self, data: Bytes) -> None:
+        """Take back what :meth:`encode` returned: nobody reads it any more."""
+        owner = data.base
+        if not self._text_bindings and owner is not None:
+            self._free.append(owner)
 
     def _fill(
         self,

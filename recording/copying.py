@@ -89,7 +89,7 @@ def _verbatim(rec: Recording, ref: ChunkRef) -> Packed | None:
         channels[channel] = (at, len(times[channel]))
         at += 9 + int.from_bytes(indexes[at + 1 : at + 9], "little")
     return Packed(
-        record,
+        (record,),
         indexes,
         channels,
         ref.first_ns,

@@ -59,11 +59,12 @@ def library_name() -> str:
 
 
 class Packed(NamedTuple):
-    """A chunk ready for the file: its record, its message indexes, and for each channel where its index
-    starts in them and how many messages it has.
+    """A chunk ready for the file: its record (in pieces), its message indexes, and for each channel where its
+    index starts in them and how many messages it has. ``written`` is called when the pieces may be used
+    again.
     """
 
-    chunk: bytes
+    chunk: Sequence[bytes | memoryview]
     indexes: bytes
     channels: dict[int, tuple[int, int]]
     first_ns: int
@@ -71,6 +72,7 @@ class Packed(NamedTuple):
     compression: str
     compressed_size: int
     uncompressed_size: int
+    written: Callable[[], object] = lambda: None
 
 
 class McapFile:
@@ -147,7 +149,9 @@ class McapFile:
     def put(self, packed: Packed) -> None:
         """Write a chunk and its message indexes."""
         start = self._at
-        self._write(packed.chunk)
+        for piece in packed.chunk:
+            self._write(piece)
+        packed.written()
         index_at = self._at
         self._write(packed.indexes)
         self._chunks.append(
@@ -274,7 +278,7 @@ def pack(
     entries[:, 1] = offsets
     index_head = _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + entries.nbytes, channel_id, entries.nbytes)
     return Packed(
-        b"".join((head, body)),
+        (head, body),
         b"".join((index_head, entries.data)),
         {channel_id: (0, len(log))},
         first,

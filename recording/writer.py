@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -374,7 +375,11 @@ class Writer:
 def _lay(encoder: Encoder, block: dict[str, NDArray[Any]], sequence: int, level: int | None) -> Packed:
     """Lay one block of rows into a chunk; runs in a worker thread."""
     data, offsets = encoder.encode(block, block["t_ns"], block["t_log_ns"], sequence)
-    return pack(data, encoder.channel_id, block["t_log_ns"], offsets, level)
+    packed = pack(data, encoder.channel_id, block["t_log_ns"], offsets, level)
+    if level is not None:
+        encoder.release(data)
+        return packed
+    return packed._replace(written=partial(encoder.release, data))
 
 
 def pack_records(records: Sequence[tuple[int, bytes]], channel_id: int) -> Packed:

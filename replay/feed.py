@@ -204,6 +204,7 @@ class Feed:
         topic, columns = self.inputs[0]
         assert topic is not None
         table = part.tables.get(topic)
+        finite = np.ones(0 if table is None else table.height, bool)
         if table is None:
             times = logs = places = np.empty(0, np.int64)
             values = np.empty((0, self.width))
@@ -219,8 +220,9 @@ class Feed:
                 else np.empty((len(times), self.width))
             )
             for i, column in enumerate(columns, 1):
-                values[:, i] = table[column].to_numpy()
-        keep, dt_s, resets = self._usable(times, values[:, 1 : 1 + len(columns)])
+                values[:, i] = given = table[column].to_numpy()
+                finite &= np.isfinite(given)
+        keep, dt_s, resets = self._usable(times, finite)
         if keep is not None:
             times, logs, places, values = times[keep], logs[keep], places[keep], values[keep]
         values[:, 0] = dt_s
@@ -233,22 +235,26 @@ class Feed:
         return Rows(values, times, logs, resets)
 
     def _usable(
-        self, times: IntArray, values: FloatArray
+        self, times: IntArray, finite: NDArray[np.bool_]
     ) -> tuple[NDArray[np.bool_] | None, FloatArray, tuple[int, ...]]:
-        """Return which rows are fed (None: all), their time differences in seconds, and where to restart."""
+        """Return which rows are fed (None: all), their time differences in seconds, and where to restart.
+
+        ``finite`` says which have all their values.
+        """
         state = self._state
         if state.stopped:
             state.after_stop += len(times)
             return np.zeros(len(times), bool), np.empty(0), ()
-        finite: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
-        state.missing.add(times[~finite])
-        kept = finite
-        known = times[finite]
+        kept, known = finite, times
+        if not finite.all():
+            state.missing.add(times[~finite])
+            known = times[finite]
         last = state.last_ns if state.last_ns is not None else np.iinfo(np.int64).min
-        latest = np.maximum.accumulate(np.concatenate(([last], known)))[:-1]
-        state.duplicate.add(known[known == latest])
-        state.backwards.add(known[known < latest])
-        if (later := known > latest).size and not later.all():
+        if known.size and (known[0] <= last or (known[1:] <= known[:-1]).any()):
+            latest = np.maximum.accumulate(np.concatenate(([last], known)))[:-1]
+            state.duplicate.add(known[known == latest])
+            state.backwards.add(known[known < latest])
+            later = known > latest
             kept = finite.copy()
             kept[np.flatnonzero(finite)[~later]] = False
             known = known[later]
