@@ -12,14 +12,17 @@ from .annotations import EventDecoder
 from .chunks import ChunkError, ChunkRef, chunk_head, read_chunk, read_index, split
 from .codec import PREFIX, Messages
 from .errors import MarchaError, UsageError
-from .mcapfile import McapFile, Packed, pack
+from .mcapfile import McapFile, Packed, pack, seal
 
 if TYPE_CHECKING:
     from .reader import Recording
 
 
-def copy_into(file: McapFile, rec: Recording, topics: Collection[str] | None) -> None:
-    """Copy channels and their messages; annotations go another way (see :meth:`Writer.copy_from`)."""
+def copy_into(file: McapFile, rec: Recording, topics: Collection[str] | None, level: int | None) -> None:
+    """Copy channels and their messages; annotations go another way (see :meth:`Writer.copy_from`).
+
+    Chunks that are not compressed are, where ``level`` is not None.
+    """
     ids = _copy_channels(file, rec, topics)
     same = all(old == new for old, new in ids.items())
     for ref in rec.chunk_refs(set(ids)):
@@ -27,8 +30,7 @@ def copy_into(file: McapFile, rec: Recording, topics: Collection[str] | None) ->
         if same and not ref.loose and ref.indexes and ids.keys() >= ref.indexes.keys():
             packed = _verbatim(rec, ref)
         if packed is not None:
-            file.drain()
-            file.put(packed)
+            file.submit(_sealed, packed, level)
             continue
         try:
             parts = split(read_chunk(rec.file, ref), ids)
@@ -36,7 +38,7 @@ def copy_into(file: McapFile, rec: Recording, topics: Collection[str] | None) ->
             rec.lost(ref, str(e))
             continue
         for old, messages in parts.items():
-            file.submit(_relay, messages, ids[old])
+            file.submit(_relay, messages, ids[old], level)
     file.drain()
 
 
@@ -100,7 +102,18 @@ def _verbatim(rec: Recording, ref: ChunkRef) -> Packed | None:
     )
 
 
-def _relay(messages: Messages, channel_id: int) -> Packed:
+def _sealed(packed: Packed, level: int | None) -> Packed:
+    """Return a chunk as it is, or compressed where it is not and should be."""
+    if level is None or packed.compression:
+        return packed
+    (record,) = packed.chunk
+    head = chunk_head(bytes(record), ChunkRef(0, len(record), packed.first_ns, packed.last_ns))
+    raw = memoryview(record)[head.start : head.start + head.length]
+    pieces, compression = seal(raw, packed.first_ns, packed.last_ns, head.crc, level)
+    return packed._replace(chunk=pieces, compression=compression, compressed_size=len(pieces[-1]))
+
+
+def _relay(messages: Messages, channel_id: int, level: int | None) -> Packed:
     """Lay the messages of one channel into a chunk of its own, under another id."""
     starts = messages.offsets - PREFIX.itemsize
     sizes = messages.sizes + PREFIX.itemsize
@@ -108,4 +121,4 @@ def _relay(messages: Messages, channel_id: int) -> Packed:
     offsets = np.cumsum(sizes) - sizes
     data[offsets + 9] = channel_id & 0xFF
     data[offsets + 10] = channel_id >> 8
-    return pack(data, channel_id, messages.log, offsets)
+    return pack(data, channel_id, messages.log, offsets, level)

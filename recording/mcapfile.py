@@ -265,25 +265,36 @@ def pack(
         Compression level of zstd; None does not compress.
     """
     raw = data.data
-    compression, body = ("", raw) if level is None else ("zstd", _compressor(level).compress(raw))
     first, last = int(log.min()), int(log.max())
-    chunk = RecordBuilder()
-    Chunk(compression, b"", last, first, crc32(raw), data.size).write(chunk)
-    # The records' own builder would copy these megabytes three times, and loop over tuples for the index.
-    head = bytearray(chunk.end())
-    _LENGTH.pack_into(head, 1, len(head) - _RECORD_HEAD + len(body))
-    _LENGTH.pack_into(head, len(head) - _LENGTH.size, len(body))
+    pieces, compression = seal(raw, first, last, crc32(raw), level)
     entries = np.empty((len(log), 2), "<u8")
     entries[:, 0] = log
     entries[:, 1] = offsets
     index_head = _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + entries.nbytes, channel_id, entries.nbytes)
     return Packed(
-        (head, body),
+        pieces,
         b"".join((index_head, entries.data)),
         {channel_id: (0, len(log))},
         first,
         last,
         compression,
-        len(body),
+        len(pieces[-1]),
         data.size,
     )
+
+
+def seal(
+    raw: memoryview, first_ns: int, last_ns: int, crc: int, level: int | None
+) -> tuple[tuple[bytes, bytes | memoryview], str]:
+    """Return the chunk record around ``raw`` in two pieces, and its compression.
+
+    The second piece is ``raw`` itself where ``level`` is None: the record class's own writer would copy these
+    megabytes three times.
+    """
+    compression, body = ("", raw) if level is None else ("zstd", _compressor(level).compress(raw))
+    builder = RecordBuilder()
+    Chunk(compression, b"", last_ns, first_ns, crc, len(raw)).write(builder)
+    head = bytearray(builder.end())
+    _LENGTH.pack_into(head, 1, len(head) - _RECORD_HEAD + len(body))
+    _LENGTH.pack_into(head, len(head) - _LENGTH.size, len(body))
+    return (bytes(head), body), compression

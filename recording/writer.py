@@ -241,7 +241,8 @@ class Writer:
         """Copy channels of another recording, with its metadata records, attachments and annotations.
 
         Chunks are copied as they are, without decompressing, unless they also hold channels that are left out
-        or channel ids are taken. Copied channels cannot be appended to.
+        or channel ids are taken; those that are not compressed are compressed, unless this writer does not.
+        Copied channels cannot be appended to.
 
         Parameters
         ----------
@@ -260,7 +261,7 @@ class Writer:
         from .copying import copy_into
 
         self._check_open()
-        copy_into(self._file, rec, topics)
+        copy_into(self._file, rec, topics, self._level)
         annotations = rec.annotations
         if topics is not None:
             annotations = annotations.filter((TOPIC + pl.col("tier")).is_in(list(topics)))
@@ -366,10 +367,10 @@ class Writer:
                 batch.append(event)
                 size += len(event[1])
                 if size >= CHUNK_SIZE:
-                    self._file.submit(pack_records, batch, id_)
+                    self._file.submit(pack_records, batch, id_, self._level)
                     batch, size = [], 0
             if batch:
-                self._file.submit(pack_records, batch, id_)
+                self._file.submit(pack_records, batch, id_, self._level)
 
 
 def _lay(encoder: Encoder, block: dict[str, NDArray[Any]], sequence: int, level: int | None) -> Packed:
@@ -382,8 +383,9 @@ def _lay(encoder: Encoder, block: dict[str, NDArray[Any]], sequence: int, level:
     return packed._replace(written=partial(encoder.release, data))
 
 
-def pack_records(records: Sequence[tuple[int, bytes]], channel_id: int) -> Packed:
+def pack_records(records: Sequence[tuple[int, bytes]], channel_id: int, level: int | None) -> Packed:
     """Pack message records, given with their log times, into a chunk."""
     sizes = np.array([len(r) for _, r in records])
     data = np.frombuffer(b"".join(r for _, r in records), "u1")
-    return pack(data, channel_id, np.array([t for t, _ in records], np.int64), np.cumsum(sizes) - sizes)
+    log = np.array([t for t, _ in records], np.int64)
+    return pack(data, channel_id, log, np.cumsum(sizes) - sizes, level)

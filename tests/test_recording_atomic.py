@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import marcha.recording as mr
 import pytest
-from marcha.recording import atomic
+from marcha.recording import MarchaError, atomic
+from marcha.recording.atomic import AtomicFile
 
 from .recording_samples import imu, write
 
@@ -173,3 +176,32 @@ def test_two_writers_of_one_file_do_not_disturb_each_other(tmp_path):
         assert mr.open(path).channels["/imu"].count == 6
     assert mr.open(path).channels["/imu"].count == 5
     assert [p.name for p in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_a_large_file_goes_to_disk_while_it_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[int] = []
+    monkeypatch.setattr("marcha.recording.atomic.SYNC_BYTES", 100)
+    monkeypatch.setattr("os.fsync", synced.append)
+    file = AtomicFile(tmp_path / "a")
+    for _ in range(5):
+        file.write(bytes(100))
+    assert synced  # before its end
+    file.commit()
+    assert (tmp_path / "a").read_bytes() == bytes(500)
+
+
+def test_a_disk_that_fails_in_the_background_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(_: int) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr("marcha.recording.atomic.SYNC_BYTES", 100)
+    monkeypatch.setattr("os.fsync", broken)
+    file = AtomicFile(tmp_path / "a")
+    file.write(bytes(100))
+    with pytest.raises(MarchaError, match="Input/output error"):
+        file.commit()
+    assert not list(tmp_path.iterdir())
