@@ -8,10 +8,16 @@ caller keeps the arrays alive.
 
 from __future__ import annotations
 
+from typing import Any
+
 from numba import njit
 
-compiled = njit(cache=True, nogil=True, _nrt=False)
+_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False}
+
+compiled = njit(**_OPTIONS)
 """Decorator of a kernel, and of a function called by kernels, that creates no array."""
 
-inlined = njit(cache=True, nogil=True, _nrt=False, forceinline=True)
-"""The same for a function that is inlined by force, so that its arguments become constants."""
+inlined = njit(**_OPTIONS, forceinline=True)
+"""The same for a function that is inlined by force: a call hands over seven words an array and asks for an
+exception afterwards, and inlined arguments become constants. For small functions, and for what runs with
+every sample."""

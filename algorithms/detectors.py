@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import layout as la
-from .compiled import compiled
+from .compiled import compiled, inlined
 from .layout import (
     BURST_START,
     C_HI,
@@ -62,6 +62,7 @@ from .layout import (
     R_RAW,
     R_STAT,
     R_STILL,
+    RAW_COUNT,
     RECORD,
     RING,
     RING_MASK,
@@ -88,7 +89,7 @@ STATISTICS: dict[str, tuple[str, ...]] = {
 DEGREES = 180.0 / math.pi
 
 
-@compiled
+@inlined
 def record(s: FloatArray, j: int) -> int:
     """Return the offset of sample ``j``'s record in the ring."""
     return int(s[RING]) + (j & int(s[RING_MASK])) * RECORD
@@ -138,7 +139,7 @@ def track_tilt(s: FloatArray, r: int) -> None:
     s[r + R_PITCH] = _pitch(s)
 
 
-@compiled
+@inlined
 def _variance(s: FloatArray, field: int, lo: int, hi: int) -> float:
     base, mask = int(s[RING]) + field, int(s[RING_MASK])
     n = hi - lo + 1
@@ -208,7 +209,7 @@ def _energy(s: FloatArray, field: int, level: float, lo: int, hi: int) -> float:
     return total / (hi - lo + 1)
 
 
-@compiled
+@inlined
 def _judge(s: FloatArray, j: int, last: int) -> None:
     """Write the statistics and the raw decision of sample ``j``; ``last`` is the newest sample there is."""
     lo = max(0, j - int(s[W_LO]))
@@ -274,7 +275,7 @@ def _keep(s: FloatArray, j: int, last: int) -> None:
     s[r + R_STILL] = 1.0 if length >= m else 0.0
 
 
-@compiled
+@inlined
 def decide(s: FloatArray, k: int, last: int) -> None:
     """Advance every stage as far as sample ``k`` allows; past the end (``k > last``) windows are cut off
     there.
@@ -286,15 +287,15 @@ def decide(s: FloatArray, k: int, last: int) -> None:
         _judge(s, j, last)
     cleaning = int(s[CLEANING])
     if cleaning == 0:
+        if 0 <= j <= last:
+            s[RAW_COUNT] += s[record(s, j) + R_RAW]
         j -= int(s[C_HI])
         if 0 <= j <= last:
-            lo = max(0, j - int(s[C_LO]))
-            hi = min(last, j + int(s[C_HI]))
-            base, mask = int(s[RING]) + R_RAW, int(s[RING_MASK])
-            ones = 0.0
-            for i in range(lo, hi + 1):
-                ones += s[base + (i & mask) * RECORD]
-            s[record(s, j) + R_STILL] = 1.0 if 2.0 * ones > hi - lo + 1 else 0.0
+            first = j - int(s[C_LO])
+            n = min(last, j + int(s[C_HI])) - max(0, first) + 1
+            s[record(s, j) + R_STILL] = 1.0 if 2.0 * s[RAW_COUNT] > n else 0.0
+            if first >= 0:
+                s[RAW_COUNT] -= s[record(s, first) + R_RAW]
     elif cleaning == 1:
         j -= int(s[C_LEN]) - 1
         if 0 <= j <= last:

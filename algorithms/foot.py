@@ -15,7 +15,7 @@ import numpy as np
 
 from . import detectors, strapdown
 from . import layout as la
-from .compiled import compiled
+from .compiled import compiled, inlined
 from .contract import AlgorithmError, FloatArray, Input, KernelEstimator, Output, Remark
 from .detectors import PITCH, decide, record, start_tilt, track_tilt
 from .layout import (
@@ -211,7 +211,7 @@ class FootParams(DetectorParams, frozen=True, forbid_unknown_fields=True, kw_onl
     step_min_m: Annotated[float, meta("Shortest displacement that is a step", "m", "ours", ge=0.0)] = 0.1
 
 
-@compiled
+@inlined
 def take(s: FloatArray, row: FloatArray) -> bool:
     """Take a row into the state; return whether a sample can be released to the filter.
 
@@ -268,7 +268,7 @@ def take_end(s: FloatArray) -> bool:
     return True
 
 
-@compiled
+@inlined
 def release(s: FloatArray) -> int:
     """Count the next sample as released and return its record."""
     j = int(s[RELEASED])
@@ -279,7 +279,7 @@ def release(s: FloatArray) -> int:
     return r
 
 
-@compiled
+@inlined
 def starts(s: FloatArray) -> bool:
     """Start the navigation where the released sample completed the rest; return True at that sample only."""
     if s[STARTED] > 0.5 or s[INIT_INDEX] < 0.0 or s[RELEASED] - 1.0 != s[INIT_INDEX]:
@@ -290,7 +290,7 @@ def starts(s: FloatArray) -> bool:
     return True
 
 
-@compiled
+@inlined
 def emit(s: FloatArray, r: int, out: FloatArray) -> None:
     """Write pose, velocity, stance and step of the sample at ``r``; NaN before the navigation has started."""
     still = s[r + R_STILL]
@@ -330,7 +330,7 @@ def _land(s: FloatArray, out: FloatArray) -> None:
         s[STEP_LAND + i] = s[POS + i]
 
 
-@compiled
+@inlined
 def emit_sigma(s: FloatArray, p: int, n: int, pos: int, vel: int, att: int, out: FloatArray) -> None:
     """Write the standard deviations of position, velocity and attitude from the covariance at ``s[p]``."""
     for i in range(3):
@@ -344,14 +344,14 @@ def emit_sigma(s: FloatArray, p: int, n: int, pos: int, vel: int, att: int, out:
             out[O_REST + 6 + i] = math.nan
 
 
-@compiled
+@inlined
 def emit_detector(s: FloatArray, r: int, first: int, out: FloatArray) -> None:
     """Write the detector's statistics of the sample at ``r`` to the end of the result."""
     for i in range(out.shape[0] - first):
         out[first + i] = s[r + R_STAT + i]
 
 
-@compiled
+@inlined
 def at_rest(s: FloatArray, r: int, since: float, rate: float) -> bool:
     """Return whether the foot has been still for ``since`` s and turns by less than ``rate`` rad/s at ``r``.
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 from . import aiding, foot, kalman, strapdown
 from . import foot_9iez as base
 from . import layout as la
-from .compiled import compiled
+from .compiled import compiled, inlined
 from .contract import FloatArray
 from .layout import ACC_N, BIAS_ACC, BIAS_GYR, POS, R_DT, R_GYR, R_STILL, ROT, STARTED, VEL
 from .parameters import meta
@@ -67,7 +67,7 @@ class Foot15IezZaruParams(base.Foot9IezParams, frozen=True, forbid_unknown_field
 Foot15IezZaruAidedParams = aiding.with_aids(Foot15IezZaruParams, "Foot15IezZaruAidedParams", __name__)
 
 
-@compiled
+@inlined
 def predict(s: FloatArray, dt: float) -> None:
     """Carry P over one time step: F P Fᵀ + Q (eqs 3.34–3.37 with the bias columns of 3.43)."""
     kalman.predict_motion(s, P, N, ATT, XPOS, XVEL, ACC_N, dt)
@@ -94,7 +94,7 @@ def correct(s: FloatArray, r: int) -> None:
     feed_back(s)
 
 
-@compiled
+@inlined
 def feed_back(s: FloatArray) -> None:
     """Take the errors in ``DX`` out of position, velocity, biases and attitude."""
     for i in range(3):

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar
 
 from . import aiding, foot, kalman, strapdown
 from . import layout as la
-from .compiled import compiled
+from .compiled import compiled, inlined
 from .contract import FloatArray
 from .layout import ACC_N, POS, R_DT, R_STILL, ROT, STARTED, VEL
 from .parameters import meta
@@ -54,7 +54,7 @@ class Foot9IezParams(foot.FootParams, frozen=True, forbid_unknown_fields=True, k
 Foot9IezAidedParams = aiding.with_aids(Foot9IezParams, "Foot9IezAidedParams", __name__)
 
 
-@compiled
+@inlined
 def predict(s: FloatArray, dt: float) -> None:
     """Carry P over one time step: F P Fᵀ + Q with f_n in ``ACC_N`` (eqs 3.34–3.37)."""
     kalman.predict_motion(s, P, N, ATT, XPOS, XVEL, ACC_N, dt)
@@ -72,7 +72,7 @@ def zero_velocity(s: FloatArray, considered: int) -> None:
     feed_back(s, considered)
 
 
-@compiled
+@inlined
 def feed_back(s: FloatArray, considered: int) -> None:
     """Take the errors in ``DX`` out of position, velocity and, unless it is considered, attitude."""
     for i in range(3):

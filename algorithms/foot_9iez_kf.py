@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 from . import foot, kalman, strapdown
 from . import foot_9iez as base
 from . import layout as la
-from .compiled import compiled
+from .compiled import compiled, inlined
 from .contract import FloatArray
 from .layout import ACC_N, BIAS_GYR, GRAVITY, R_DT, R_GYR, R_NORM_ACC, R_STILL, ROT, STARTED
 from .parameters import meta
@@ -76,7 +76,7 @@ class Foot9IezKfParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=T
     ] = False
 
 
-@compiled
+@inlined
 def _predict(s: FloatArray, dt: float) -> None:
     kalman.predict_bias(s, P, M, TILT, BIAS, ROT, dt)
     kalman.add_noise(s, P, M, TILT, s[Q_TURN] * dt * dt)
@@ -110,7 +110,7 @@ def _correct(s: FloatArray, r: int) -> None:
         s[BIAS_GYR + i] -= s[DX + BIAS + i]
 
 
-@compiled
+@inlined
 def _advance(s: FloatArray, r: int) -> None:
     strapdown.resolve(s, r)
     x, y, z = s[ACC_N], s[ACC_N + 1], s[ACC_N + 2]

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar
 from . import foot, strapdown
 from . import foot_9iez as base
 from . import layout as la
-from .compiled import compiled
+from .compiled import compiled, inlined
 from .contract import FloatArray
 from .layout import ACC_N, BIAS_GYR, R_ACC, R_DT, R_GYR, R_STILL, ROT, STARTED
 from .parameters import meta
@@ -42,7 +42,7 @@ class Foot9IezMadParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=
     ] = False
 
 
-@compiled
+@inlined
 def madgwick(
     s: FloatArray,
     q: int,
@@ -90,7 +90,7 @@ def madgwick(
     s[q], s[q + 1], s[q + 2], s[q + 3] = a / norm, b / norm, c / norm, d / norm
 
 
-@compiled
+@inlined
 def _advance(s: FloatArray, r: int) -> None:
     strapdown.resolve(s, r)
     x, y, z = s[ACC_N], s[ACC_N + 1], s[ACC_N + 2]

@@ -46,6 +46,7 @@ TAKEN = _take()  # rows taken
 DECIDED = _take()  # row up to which the detector's stages have come; runs past the end in a flush
 RELEASED = _take()  # samples handed to the filter
 LAST_ONE = _take()  # newest raw "still" at or before the sample being filled, −1 none
+RAW_COUNT = _take()  # raw "still" in the median's window, counted as samples enter and leave it
 BURST_START = _take()  # first sample of the run of filled "still" that is being cleaned
 TIME = _take()  # s since the first row, at the newest row
 TIME_OUT = _take()  # s since the first row, at the released sample

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .compiled import compiled
+from .compiled import compiled, inlined
 
 FloatArray = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ def rot_from_rpy(s: FloatArray, at: int, roll: float, pitch: float, yaw: float) 
     s[at + 8] = cp * cr
 
 
-@compiled
+@inlined
 def quat_from_rot(s: FloatArray, at: int, out: FloatArray, to: int) -> None:
     """Write the unit quaternion (wxyz, w ≥ 0) of the rotation at ``s[at:at+9]`` to ``out[to:to+4]``.
 
@@ -71,7 +71,7 @@ def quat_from_rot(s: FloatArray, at: int, out: FloatArray, to: int) -> None:
     out[to + 3] = z * scale
 
 
-@compiled
+@inlined
 def rot_from_quat(q: FloatArray, at: int, s: FloatArray, to: int) -> None:
     """Write the rotation of the unit quaternion (wxyz) at ``q[at:at+4]`` to ``s[to:to+9]``."""
     w, x, y, z = q[at], q[at + 1], q[at + 2], q[at + 3]
@@ -86,7 +86,7 @@ def rot_from_quat(q: FloatArray, at: int, s: FloatArray, to: int) -> None:
     s[to + 8] = 1.0 - 2.0 * (x * x + y * y)
 
 
-@compiled
+@inlined
 def turn_body(s: FloatArray, at: int, x: float, y: float, z: float) -> None:
     """Multiply the rotation at ``s[at:at+9]`` from the right by ``(2I + [θ]×)(2I − [θ]×)⁻¹``, θ = (x, y, z)
     in rad.
@@ -112,7 +112,7 @@ def turn_body(s: FloatArray, at: int, x: float, y: float, z: float) -> None:
         s[i + 2] = u * m02 + v * m12 + w * m22
 
 
-@compiled
+@inlined
 def turn_nav(s: FloatArray, at: int, x: float, y: float, z: float) -> None:
     """Multiply the rotation at ``s[at:at+9]`` from the left by ``(2I + [θ]×)(2I − [θ]×)⁻¹``, θ = (x, y, z)
     in rad.
@@ -135,7 +135,7 @@ def turn_nav(s: FloatArray, at: int, x: float, y: float, z: float) -> None:
         s[j + 6] = m20 * u + m21 * v + m22 * w
 
 
-@compiled
+@inlined
 def orthonormalize(s: FloatArray, at: int) -> None:
     """Take rounding out of a rotation: ``C ← C (3I − CᵀC)/2``, the symmetric correction to first order."""
     c00, c01, c02 = s[at], s[at + 1], s[at + 2]

@@ -19,7 +19,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .compiled import compiled
+from .compiled import compiled, inlined
 from .layout import (
     ACC_N,
     ACC_OLD,
@@ -58,13 +58,13 @@ LONGEST_PAUSE_S = 0.5
 """A longer time step interrupts a rest: nothing is known about what happened in it."""
 
 
-@compiled
+@inlined
 def _distance(s: FloatArray, a: int, b: int) -> float:
     x, y, z = s[a] - s[b], s[a + 1] - s[b + 1], s[a + 2] - s[b + 2]
     return math.sqrt(x * x + y * y + z * z)
 
 
-@compiled
+@inlined
 def watch_rest(s: FloatArray, r: int, k: int) -> bool:
     """Take sample ``k`` (record at ``r``) into the search for a rest; return True at the sample that
     completes it.
@@ -127,7 +127,7 @@ def start(s: FloatArray) -> None:
     s[ACC_OLD + 2] -= s[GRAVITY]
 
 
-@compiled
+@inlined
 def turn(s: FloatArray, r: int) -> None:
     """Turn the attitude by the sample at ``r``."""
     dt = s[r + R_DT]
@@ -140,7 +140,7 @@ def turn(s: FloatArray, r: int) -> None:
     )
 
 
-@compiled
+@inlined
 def resolve(s: FloatArray, r: int) -> None:
     """Write the bias-free specific force of the sample at ``r``, by the present attitude, to ``ACC_N``."""
     x = s[r + R_ACC] - s[BIAS_ACC]
@@ -150,7 +150,7 @@ def resolve(s: FloatArray, r: int) -> None:
         s[ACC_N + i] = s[ROT + 3 * i] * x + s[ROT + 3 * i + 1] * y + s[ROT + 3 * i + 2] * z
 
 
-@compiled
+@inlined
 def move(s: FloatArray, dt: float) -> None:
     """Integrate velocity and position by the specific force in ``ACC_N``."""
     for i in range(3):
@@ -167,7 +167,7 @@ def move(s: FloatArray, dt: float) -> None:
         s[ACC_OLD + i] = a
 
 
-@compiled
+@inlined
 def average_force(s: FloatArray, x: float, y: float, z: float) -> None:
     """Replace ``ACC_N`` by its mean with (x, y, z), the force resolved before the turn (trapezoid only)."""
     if s[TRAPEZOID] > 0.5:
@@ -176,7 +176,7 @@ def average_force(s: FloatArray, x: float, y: float, z: float) -> None:
         s[ACC_N + 2] = 0.5 * (s[ACC_N + 2] + z)
 
 
-@compiled
+@inlined
 def advance(s: FloatArray, r: int) -> None:
     """Carry attitude, velocity and position over the time step of the sample at ``r``."""
     resolve(s, r)
