@@ -116,22 +116,28 @@ def encode_events(rows: pl.DataFrame, channel_id: int) -> Iterator[tuple[int, by
         yield start, _PREFIX.pack(5, size, channel_id, i, start, start) + message
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=256)
 def _pairs(label: str, text: str) -> bytes:
     """Return the key-value pairs of one event: as ``cdr.encode`` does, ten times as fast."""
-    pairs = {"label": label, **_TEXTS.decode(text)}
-    strings = b"".join([_string(text) for pair in pairs.items() for text in pair])
-    last = next(reversed(pairs.values()))
+    pairs = _TEXTS.decode(text)
+    strings = [_string("label"), _string(label)]
+    for key, value in pairs.items():
+        strings += (_string(key), _string(value))
+    raw = b"".join(strings)
+    last = next(reversed(pairs.values()), label)
     padding = -(len(last.encode()) + 1) % 4  # stands between strings, not behind the last
-    return len(pairs).to_bytes(4, "little") + strings[: len(strings) - padding]
+    return (len(pairs) + 1).to_bytes(4, "little") + raw[: len(raw) - padding]
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=65_536)
 def _string(text: str) -> bytes:
     raw = text.encode() + b"\0"
-    if len(raw) != raw.index(b"\0") + 1:
+    if raw.find(b"\0") != len(raw) - 1:
         raise CdrError(f"{text!r}: a string may not contain NUL")
-    return len(raw).to_bytes(4, "little") + raw + bytes(-len(raw) % 4)
+    return len(raw).to_bytes(4, "little") + raw + _PADDING[len(raw) % 4]
+
+
+_PADDING = (b"", bytes(3), bytes(2), bytes(1))
 
 
 _TEXTS = msgspec.json.Decoder(dict[str, str])

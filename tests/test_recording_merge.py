@@ -93,7 +93,7 @@ def test_few_rows_are_held_whatever_the_length(tmp_path, monkeypatch):
     emit = rec._emit
 
     def spy(tables, horizon, max_rows):
-        held.append(sum(t.height for parts in tables.values() for t in parts))
+        held.append(sum(len(columns["t_ns"]) for parts in tables.values() for columns in parts))
         return emit(tables, horizon, max_rows)
 
     monkeypatch.setattr(rec, "_emit", spy)
