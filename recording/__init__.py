@@ -60,8 +60,8 @@ def create(path: Path | str, *, overwrite: bool = False, level: int | None = ZST
     overwrite : bool
         Whether it may be replaced.
     level : int or None
-        Compression level of zstd; None does not compress. The default suits raw readings; computed numbers,
-        whose low bits are noise, lose little by being compressed.
+        Compression level of zstd; None does not compress. The default suits raw readings; the low bits of
+        computed numbers are noise that no level shortens.
 
     Raises
     ------

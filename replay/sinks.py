@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Protocol
 import polars as pl
 
 from ..recording import create
-from .blocks import Block, joined
+from .blocks import Block
 from .plan import Plan
 
 if TYPE_CHECKING:
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 
 LEVEL = None
-"""Estimates are not compressed: their low bits are noise. zstd −3 would save 40 % and take as long as all the
-rest of a replay in blocks. They can be computed again; a recording exported to be handed on is compressed."""
+"""Estimates are not compressed: their low bits are noise. zstd −3 would save 40 % of their size and take as
+long as all the rest of writing them. A recording that is exported to be handed on is compressed."""
 
 
 class Sink(Protocol):
@@ -54,36 +54,32 @@ class TableSink:
     raw = False
 
     def __init__(self) -> None:
-        self._blocks: dict[str, list[Block]] = {}
+        self._pieces: dict[str, list[pl.DataFrame]] = {}
         self._plan: Plan | None = None
 
     def open(self, plan: Plan) -> None:
         """Start anew."""
         self._plan = plan
-        self._blocks = {}
+        self._pieces = {}
 
     def write(self, topic: str, table: pl.DataFrame) -> None:
         """Keep it."""
-        self.write_block(topic, Block(table))
-
-    def write_block(self, topic: str, block: Block) -> None:
-        """Keep it."""
-        self._blocks.setdefault(topic, []).append(block)
+        self._pieces.setdefault(topic, []).append(table)
 
     def rewind(self, t_log_ns: int) -> None:
         """Forget what was logged from ``t_log_ns`` on."""
-        for topic, blocks in self._blocks.items():
-            self._blocks[topic] = [Block(b.table.filter(pl.col("t_log_ns") < t_log_ns)) for b in blocks]
+        for topic, pieces in self._pieces.items():
+            self._pieces[topic] = [p.filter(pl.col("t_log_ns") < t_log_ns) for p in pieces]
 
     def close(self, result: ReplayResult | None) -> None:
         """Nothing to do."""
 
     def table(self, topic: str) -> pl.DataFrame | None:
         """Return all messages of a topic, None where it is not one of a run's."""
-        if blocks := self._blocks.get(topic):
-            whole = Block(joined(blocks).table)
-            self._blocks[topic] = [whole]
-            return whole.table
+        if pieces := self._pieces.get(topic):
+            whole = pl.concat(pieces)
+            self._pieces[topic] = [whole]
+            return whole
         channel = self._plan.channels.get(topic) if self._plan else None
         if channel is None:
             return None
