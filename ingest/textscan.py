@@ -20,18 +20,22 @@ _TAB, _LF, _CR, _SPACE, _COMMA, _SEMICOLON, _COLON, _DOT, _PLUS, _MINUS = (
     45,
 )
 
+# Without counting references to the arrays (_nrt): numba would do that, atomically, at every call of a row.
+_compiled = numba.njit(cache=True, nogil=True, _nrt=False)
+_inlined = numba.njit(cache=True, nogil=True, _nrt=False, forceinline=True)
 
-@numba.njit(cache=True, nogil=True)
+
+@_inlined
 def _digit(c):
     return 48 <= c <= 57
 
 
-@numba.njit(cache=True, nogil=True)
+@_inlined
 def _space(c):
     return c == 32 or c == 9
 
 
-@numba.njit(cache=True, nogil=True)
+@_compiled
 def _wall_clock(data, a, b):
     """Return (ms of the day, position behind it) of ``[date ]hh:mm:ss[.fff] `` at ``a``, or (-1, a)."""
     i = a
@@ -65,7 +69,7 @@ def _wall_clock(data, a, b):
     return ms, i
 
 
-@numba.njit(cache=True, nogil=True)
+@_compiled
 def _words(data, a, b):
     """Whether a line is text (a boot message, a header): begins like it and has no cell that is a number."""
     c = data[a]
@@ -89,7 +93,7 @@ def _words(data, a, b):
     return True
 
 
-@numba.njit(cache=True, nogil=True)
+@_inlined
 def _clean_row(data, pos, n, low, high, values, row):
     """Read a row of the plainest form, or a blank line; return where the next begins, -1 if it is neither."""
     columns = low.size
@@ -125,7 +129,7 @@ def _clean_row(data, pos, n, low, high, values, row):
     return i + 1 if data[i] == 10 else np.int64(-1)
 
 
-@numba.njit(cache=True, nogil=True)
+@_compiled
 def scan(data, low, high, first_line, values, lines, wall, odd):
     """Read all lines of ``data`` into ``values`` (columns, rows).
 
