@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import numpy as np
 
@@ -21,8 +23,9 @@ _TAB, _LF, _CR, _SPACE, _COMMA, _SEMICOLON, _COLON, _DOT, _PLUS, _MINUS = (
 )
 
 # Without counting references to the arrays (_nrt): numba would do that, atomically, at every call of a row.
-_compiled = numba.njit(cache=True, nogil=True, _nrt=False)
-_inlined = numba.njit(cache=True, nogil=True, _nrt=False, forceinline=True)
+_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False}
+_compiled = numba.njit(**_OPTIONS)
+_inlined = numba.njit(**_OPTIONS, forceinline=True)
 
 
 @_inlined
