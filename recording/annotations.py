@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import lru_cache
 from typing import Any
 
@@ -25,7 +26,7 @@ COLUMNS: dict[str, Any] = {
     "label": pl.String,
     "metadata": pl.String,
 }
-"""Columns of an annotation table; ``metadata`` is the text of a JSON object of strings."""
+"""Columns of an annotation table; ``metadata`` is the text of a JSON object of strings, compact, keys sorted."""
 
 
 def check_annotations(table: pl.DataFrame) -> pl.DataFrame:
@@ -48,7 +49,8 @@ def check_annotations(table: pl.DataFrame) -> pl.DataFrame:
     if set(table.columns) != set(COLUMNS):
         odd = ", ".join(sorted(set(table.columns) ^ set(COLUMNS)))
         raise MarchaError(f"annotations: columns missing or unknown: {odd}; they are {', '.join(COLUMNS)}")
-    table = table.with_columns(_checked(table["metadata"])).select(*COLUMNS)
+    values = [_metadata(v) for v in table["metadata"].to_list()]
+    table = table.with_columns(pl.Series("metadata", values, dtype=pl.String)).select(*COLUMNS)
     for name, kind in COLUMNS.items():
         if table.height and table.schema[name] != kind:
             raise MarchaError(f"annotations: column {name!r}: type {table.schema[name]}, must be {kind}")
@@ -69,21 +71,13 @@ def check_annotations(table: pl.DataFrame) -> pl.DataFrame:
     return table.sort("tier", "start_ns", maintain_order=True)
 
 
-_PLAIN = r'^\{("[^"\\]*": "[^"\\]*"(, "[^"\\]*": "[^"\\]*")*)?\}$'
-"""Text of an object of strings as :func:`_metadata` writes it (keys in any order), without escapes."""
-
-
-def _checked(metadata: pl.Series) -> pl.Series:
-    """Return the metadata as JSON text. What plainly is that already is not parsed: a walk has thousands."""
-    if metadata.dtype == pl.String:
-        plain = metadata.str.contains(_PLAIN) & ~metadata.str.contains('"label": ', literal=True)
-        if plain.all(ignore_nulls=False):
-            return metadata
-    return pl.Series("metadata", [_metadata(v) for v in metadata.to_list()], dtype=pl.String)
-
-
 def _metadata(value: Any) -> str:
+    """Return the text of a JSON object of strings: compact, its keys in the order of the alphabet."""
     if isinstance(value, str):
+        with suppress(msgspec.DecodeError):  # an object of strings already, the usual case
+            texts = _TEXTS.decode(value)
+            if "label" not in texts:
+                return _CANONICAL.encode(texts).decode()
         try:
             value = json.loads(value or "{}")
         except ValueError:
@@ -99,7 +93,7 @@ def _metadata(value: Any) -> str:
         for k, v in value.items()
         if v is not None
     }
-    return json.dumps(texts, ensure_ascii=False, sort_keys=True)
+    return _CANONICAL.encode(texts).decode()
 
 
 def encode_events(rows: pl.DataFrame, channel_id: int) -> Iterator[tuple[int, bytes]]:
@@ -119,14 +113,10 @@ def encode_events(rows: pl.DataFrame, channel_id: int) -> Iterator[tuple[int, by
 @lru_cache(maxsize=256)
 def _pairs(label: str, text: str) -> bytes:
     """Return the key-value pairs of one event: as ``cdr.encode`` does, ten times as fast."""
-    pairs = _TEXTS.decode(text)
-    strings = [_string("label"), _string(label)]
-    for key, value in pairs.items():
-        strings += (_string(key), _string(value))
-    raw = b"".join(strings)
-    last = next(reversed(pairs.values()), label)
-    padding = -(len(last.encode()) + 1) % 4  # stands between strings, not behind the last
-    return (len(pairs) + 1).to_bytes(4, "little") + raw[: len(raw) - padding]
+    pairs = [("label", label), *_TEXTS.decode(text).items()]
+    raw = b"".join([_string(part) for pair in pairs for part in pair])
+    padding = -(len(pairs[-1][1].encode()) + 1) % 4  # stands between strings, not behind the last
+    return len(pairs).to_bytes(4, "little") + raw[: len(raw) - padding]
 
 
 @lru_cache(maxsize=65_536)
@@ -138,9 +128,8 @@ def _string(text: str) -> bytes:
 
 
 _PADDING = (b"", bytes(3), bytes(2), bytes(1))
-
-
 _TEXTS = msgspec.json.Decoder(dict[str, str])
+_CANONICAL = msgspec.json.Encoder(order="sorted")
 _EVENT = struct.Struct("<4siIiI")
 _PREFIX = struct.Struct("<BQHIQQ")
 """``codec.PREFIX`` for one record."""
@@ -171,7 +160,7 @@ class EventDecoder:
             start, end = (value[k]["sec"] * SECOND + value[k]["nanosec"] for k in ("start_time", "end_time"))
             pairs = {p["key"]: p["value"] for p in value["metadata"]}
             label = pairs.pop("label", "")
-            text = json.dumps(pairs, ensure_ascii=False, sort_keys=True)
+            text = _CANONICAL.encode(pairs).decode()
             rows.append((start, int(messages.log[i]), start, end, label, text))
         names: dict[str, Any] = {
             "t_ns": pl.Int64,

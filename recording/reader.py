@@ -613,8 +613,10 @@ def _join(parts: Sequence[Columns]) -> pl.DataFrame:
 
 def _columns(table: pl.DataFrame) -> Columns:
     """Return a table's columns, as arrays where they are no other than these."""
-    arrays = {s.name: s for s in table.get_columns()}
-    return {k: s.to_numpy() if s.dtype.is_numeric() and not s.null_count() else s for k, s in arrays.items()}
+    return {
+        s.name: s.to_numpy() if (s.dtype.is_numeric() or s.dtype == pl.Boolean) and not s.null_count() else s
+        for s in table.get_columns()
+    }
 
 
 def _in_order(table: pl.DataFrame) -> pl.DataFrame:

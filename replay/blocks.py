@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any
 
-import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
@@ -45,8 +44,4 @@ def joined(blocks: list[Block]) -> Block:
     """Return the blocks of one topic as one; at least one."""
     if len(blocks) == 1:
         return blocks[0]
-    parts = [b.rows for b in blocks]
-    arrays = [p for p in parts if not isinstance(p, pl.DataFrame)]
-    if len(arrays) == len(parts):
-        return Block({name: np.concatenate([p[name] for p in arrays]) for name in arrays[0]})
     return Block(pl.concat([b.table for b in blocks]))

@@ -60,7 +60,7 @@ class Runner:
         self._state = _State()
         self._compile()
         self._fresh = self._estimator_snapshot()
-        self._out: FloatArray | None = None
+        self._out = np.empty((STRETCH, len(self.columns)))
         self._rows: list[tuple[FloatArray, IntArray]] = []  # of an offline estimator, the present segment
 
     def _compile(self) -> None:
@@ -165,12 +165,10 @@ class Runner:
                 columns, t_log_ns = columns[:, early:], t_log_ns[early:]
             times = known[: len(known) - self.latency] if len(known) > self.latency else known[:0]
             times = times[len(times) - columns.shape[1] :]
-        return self._blocks(columns, times, t_log_ns)
+        return self._by_output(columns, times, t_log_ns)
 
     def _results(self, rows: FloatArray) -> FloatArray:
         """Return the result of every row, NaN where there is none; valid until the next call."""
-        if self._out is None:
-            self._out = np.empty((STRETCH, len(self.columns)))
         out = self._out[: len(rows)]
         out.fill(np.nan)
         begin = time.perf_counter()
@@ -206,9 +204,9 @@ class Runner:
                 f"estimator {self.plan.name} returned {out.shape} at its end, "
                 f"expected ({len(times)}, {len(self.columns)})"
             )
-        return self._blocks(np.ascontiguousarray(out.T), times, np.full(len(times), state.last_log_ns))
+        return self._by_output(np.ascontiguousarray(out.T), times, np.full(len(times), state.last_log_ns))
 
-    def _blocks(self, columns: FloatArray, t_ns: IntArray, t_log_ns: IntArray) -> dict[str, Block]:
+    def _by_output(self, columns: FloatArray, t_ns: IntArray, t_log_ns: IntArray) -> dict[str, Block]:
         """Return a block an output; ``columns`` is (columns, rows)."""
         blocks: dict[str, Block] = {}
         first = 0

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from marcha.recording.annotations import encode_events
 from marcha.recording.cdr import encode
 from marcha.recording.definitions import load
+from marcha.recording.errors import MarchaError
 from marcha.recording.integrity import structure
 from marcha.recording.provenance import hash_file, provenance, sources_of
 from mcap.reader import make_reader
@@ -26,7 +27,7 @@ TABLE = pl.DataFrame(
         "start_ns": [5_000_000_001, 2, 1],
         "end_ns": [9_000_000_000, 2, 4],
         "label": ["stairs", "Stürzt", "flat"],
-        "metadata": ['{"floor": "2"}', "{}", '{"a": "b", "c": "d"}'],
+        "metadata": ['{"floor":"2"}', "{}", '{"a":"b","c":"d"}'],
     }
 )
 
@@ -38,6 +39,23 @@ def test_annotations_read_back_by_time(tmp_path):
     assert rec.annotations.equals(TABLE.sort("start_ns"))
     assert rec.channels["/annotation/terrain"].columns == ("start_ns", "end_ns", "label", "metadata")
     assert structure(rec) == []
+
+
+@pytest.mark.parametrize("text", ['{"a": "x\ny"}', '{"a": "\x00"}', '{"a": 1', '{"label": "x"}', '["a"]'])
+def test_metadata_that_is_no_object_of_strings_is_one_line(tmp_path, text):
+    with pytest.raises(MarchaError, match="metadata") as error, mr.create(tmp_path / "a.mcap") as out:
+        out.add_annotations(TABLE.with_columns(metadata=pl.lit(text)))
+    assert "\n" not in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_order_of_keys_is_that_of_the_alphabet(tmp_path):
+    files = []
+    for name, text in (("a", '{"b": "1", "a": "2"}'), ("b", '{"a": "2", "b": "1"}')):
+        with mr.create(tmp_path / name) as out:
+            out.add_annotations(TABLE.with_columns(metadata=pl.lit(text)))
+        files.append((tmp_path / name).read_bytes())
+    assert files[0] == files[1]
 
 
 def test_others_see_foxglove_events(tmp_path):
@@ -93,7 +111,13 @@ rows = st.tuples(
 def test_any_annotations_round_trip(tmp_path_factory, values):
     table = pl.DataFrame(
         [
-            (t, min(a, b), max(a, b), label, json.dumps(m, sort_keys=True, ensure_ascii=False))
+            (
+                t,
+                min(a, b),
+                max(a, b),
+                label,
+                json.dumps(m, sort_keys=True, ensure_ascii=False, separators=(",", ":")),
+            )
             for t, a, b, label, m in values
         ],
         schema=TABLE.schema,

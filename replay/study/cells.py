@@ -29,7 +29,7 @@ from ..plan import NOT_RAW, EstimatorSpec
 from .plan import Job, Source, Task
 
 #: Points that are kept of a track: enough for a figure, small enough for hundreds of walks.
-TRACK_POINTS = 250
+TRACK_POINTS = 400
 
 
 class Cell(msgspec.Struct, frozen=True):

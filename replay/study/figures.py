@@ -400,7 +400,7 @@ def render_drawing(drawing: Drawing) -> Picture | None:
         figure.set_layout_engine("none")
         png, svg = io.BytesIO(), io.BytesIO()
         # Not savefig: it draws everything twice.
-        FigureCanvasAgg(figure).print_png(png, pil_kwargs={"compress_level": 2})  # 6: three times as long
+        FigureCanvasAgg(figure).print_png(png)
         FigureCanvasSVG(figure).print_svg(svg, metadata={"Date": None})
     return Picture(drawing.name, drawing.section, drawing.caption, png.getvalue(), svg.getvalue())
 
