@@ -26,7 +26,7 @@ COLUMNS: dict[str, Any] = {
     "label": pl.String,
     "metadata": pl.String,
 }
-"""Columns of an annotation table; ``metadata`` is the text of a JSON object of strings, compact, keys sorted."""
+"""Columns of an annotation table; ``metadata`` is JSON text: an object of strings, compact, keys sorted."""
 
 
 def check_annotations(table: pl.DataFrame) -> pl.DataFrame:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import os
-from concurrent.futures import Future
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
 from pathlib import Path
 
 from .errors import MarchaError, OutputExists, UsageError
@@ -12,6 +14,9 @@ from .threads import helpers
 
 SYNC_BYTES = 1 << 26
 """So many bytes go to disk together, while more are being written."""
+
+_QUEUE = 16
+"""Writes that may wait for the disk: bounds memory."""
 
 
 class AtomicFile:
@@ -36,8 +41,11 @@ class AtomicFile:
         self.path = path
         self.overwrite = overwrite
         self._done = False
-        self._waiting = 0
+        self._writer: Executor = helpers("file", 1)
+        self._writing: deque[Future[None]] = deque()
+        self._syncer: Executor = helpers("sync", 1)
         self._syncing: Future[None] | None = None
+        self._unsynced = 0
         if path.is_dir():
             raise UsageError(f"{path}: is a folder; name a file")
         if path.exists() and not overwrite:
@@ -56,33 +64,47 @@ class AtomicFile:
                 raise _failure(path, e) from None
         _lock(self._file.fileno())
 
-    def write(self, data: bytes | memoryview) -> None:
-        """Append bytes; what has come together goes to disk in the background.
+    def write(self, *pieces: bytes | memoryview, written: Callable[[], object] | None = None) -> None:
+        """Append bytes, in the background; what has come together goes to disk meanwhile.
+
+        Parameters
+        ----------
+        *pieces : bytes or memoryview
+            One behind the other. They must stay as they are until they are written.
+        written : callable, optional
+            Called when they are, from another thread.
 
         Raises
         ------
         MarchaError
-            The disk is full or failed; nothing is left.
+            The disk is full or failed, now or with an earlier call; nothing is left.
         """
         try:
-            self._file.write(data)
-            self._waiting += len(data)
-            if self._waiting >= SYNC_BYTES:
-                self._sync_behind()
+            while len(self._writing) >= _QUEUE:
+                self._writing.popleft().result()
+            self._writing.append(self._writer.submit(self._write, pieces, written))
         except OSError as e:
             self.abort()
             raise _failure(self.path, e) from None
 
-    def _sync_behind(self) -> None:
-        """Send to disk what was written, in a thread: nobody should wait for all of it at the end."""
-        if self._syncing is None:
-            self._pool = helpers("sync", 1)
-        elif not self._syncing.done():
-            return
-        else:
+    def _write(self, pieces: tuple[bytes | memoryview, ...], written: Callable[[], object] | None) -> None:
+        for piece in pieces:
+            self._file.write(piece)
+            self._unsynced += len(piece)
+        if written is not None:
+            written()
+        if self._unsynced >= SYNC_BYTES and (self._syncing is None or self._syncing.done()):
+            if self._syncing is not None:
+                self._syncing.result()
+            self._unsynced = 0
+            self._syncing = self._syncer.submit(os.fsync, self._file.fileno())
+
+    def _settle(self) -> None:
+        """Wait for what is done in the background; raise what went wrong there."""
+        while self._writing:
+            self._writing.popleft().result()
+        if self._syncing is not None:
             self._syncing.result()
-        self._waiting = 0
-        self._syncing = self._pool.submit(os.fsync, self._file.fileno())
 
     def commit(self) -> None:
         """Flush to disk and put the file in its place.
@@ -95,16 +117,14 @@ class AtomicFile:
             The disk is full or failed; nothing is left.
         """
         try:
-            if self._syncing is not None:
-                self._syncing.result()
-                self._pool.shutdown()
+            self._settle()
             self._file.flush()
             os.fsync(self._file.fileno())
             if self.overwrite:
                 os.replace(self.part, self.path)
             else:
                 _place(self.part, self.path)
-            self._file.close()
+            self._close()
             _sync_folder(self.path.parent)
         except FileExistsError:
             self.abort()
@@ -119,11 +139,14 @@ class AtomicFile:
         if self._done:
             return
         self._done = True
-        if self._syncing is not None:
-            self._pool.shutdown()
         with contextlib.suppress(OSError):  # close() flushes, and the disk may be full
-            self._file.close()
+            self._close()
         self.part.unlink(missing_ok=True)
+
+    def _close(self) -> None:
+        self._writer.shutdown(cancel_futures=True)
+        self._syncer.shutdown()
+        self._file.close()
 
 
 def _place(part: Path, path: Path) -> None:

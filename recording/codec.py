@@ -30,6 +30,10 @@ SECOND = 1_000_000_000
 MAX_TIME_NS = 2**31 * SECOND - 1
 """The last moment that ``builtin_interfaces/Time`` can hold."""
 
+WORD, NARROWED, HALF, TIME, OCTET = range(5)
+"""How a number gets from its column into its field: eight bytes as they are, a double into a float, four
+bytes, nanoseconds (int64) into seconds and nanoseconds, one byte."""
+
 _EXPAND = 64
 """Longest fixed array of a foreign message that becomes one column an element."""
 
@@ -40,6 +44,111 @@ class Binding(NamedTuple):
     column: str
     kind: str
     path: str
+
+
+class Form(NamedTuple):
+    """A record whose texts are known.
+
+    Attributes
+    ----------
+    dtype : numpy.dtype
+        Structured type of the record.
+    template : ndarray of uint8
+        The record with every number 0.
+    fields : list of (int, str, int, int)
+        Kind, column, where in a value of it (byte), and where in the record the field lies; sorted by kind
+        (:data:`WORD` …); the column "" is the publish time.
+    """
+
+    dtype: np.dtype[Any]
+    template: Bytes
+    fields: list[tuple[int, str, int, int]]
+
+
+class Chunk:
+    """A chunk of one channel being laid: records of one size and their index.
+
+    Parameters
+    ----------
+    size : int
+        Bytes of a record.
+    most : int
+        Records that it holds.
+    """
+
+    def __init__(self, size: int, most: int) -> None:
+        self.size = size
+        self.most = most
+        self.rows = 0
+        self._data = np.empty(size * most, np.uint8)
+        self._index = np.empty((most, 2), np.int64)
+
+    @property
+    def data(self) -> Bytes:
+        """The records that are there."""
+        return self._data[: self.rows * self.size]
+
+    @property
+    def index(self) -> NDArray[np.int64]:
+        """Log time of each, and where it starts in ``data``."""
+        return self._index[: self.rows]
+
+    def lay(self, rows: Rows, first: int, n: int, sequence: int) -> None:
+        """Lay ``n`` rows from the ``first`` on behind what is there."""
+        from .compiled import lay  # numba takes a third of a second to import
+
+        index = self._index[self.rows :]
+        index[0, 1] = self.rows * self.size
+        fields = rows.fields.copy()
+        fields[:, 0] += first * fields[:, 1]
+        lay(
+            self._data,
+            index,
+            rows.template,
+            sequence,
+            rows.times + 8 * first,
+            fields,
+            rows.ends,
+            self.size,
+            n,
+        )
+        self.rows += n
+
+
+class Rows:
+    """Rows of a channel as :meth:`Chunk.lay` takes them: where in memory their numbers are.
+
+    Parameters
+    ----------
+    form : Form
+        The record.
+    columns : mapping of str to ndarray
+        As :meth:`Encoder.arrays` returns them.
+    t_ns, t_log_ns : ndarray of int64, shape (n,)
+        Time that the message speaks of, and when it was known.
+    """
+
+    def __init__(
+        self,
+        form: Form,
+        columns: Mapping[str, NDArray[Any]],
+        t_ns: NDArray[np.int64],
+        t_log_ns: NDArray[np.int64],
+    ) -> None:
+        times = np.ascontiguousarray(t_log_ns), np.ascontiguousarray(t_ns)
+        self.template = form.template
+        self.times = np.array([_address(t) for t in times])
+        given = {"": times[1], **columns}
+        places = {name: (_address(values), values.strides[0]) for name, values in given.items()}
+        self.fields = np.array(
+            [(places[c][0] + inside, places[c][1], at) for _, c, inside, at in form.fields], np.int64
+        ).reshape(-1, 3)
+        self.ends = np.searchsorted([kind for kind, *_ in form.fields], np.arange(5), side="right")
+        self._alive = times, columns
+
+
+def _address(values: NDArray[Any]) -> int:
+    return values.__array_interface__["data"][0]
 
 
 # ---------------------------------------------------------------------------------------- tables to messages
@@ -155,12 +264,12 @@ class Encoder:
             constants = group.present if group in groups else group.absent
             self._constants |= {self._root + k: v for k, v in constants.items()}
         self._text_bindings = [b for b in self.bindings if b.kind == "text"]
-        self._free: list[Bytes] = []
-        self._cache: dict[tuple[bytes, ...], tuple[np.dtype[Any], Bytes]] = {}
-        self.record_size = self._plan(tuple(b"" for _ in self._text_bindings))[1].size
+        self._free: list[Chunk] = []
+        self._cache: dict[tuple[bytes, ...], Form] = {}
+        self.record_size = self._plan(tuple(b"" for _ in self._text_bindings)).template.size
 
-    def _plan(self, texts: tuple[bytes, ...]) -> tuple[np.dtype[Any], Bytes]:
-        """Return the record type and the template record for given values of the text columns."""
+    def _plan(self, texts: tuple[bytes, ...]) -> Form:
+        """Return the record for given values of the text columns."""
         if texts in self._cache:
             return self._cache[texts]
         strings = self._texts | {b.path: t for b, t in zip(self._text_bindings, texts, strict=True)}
@@ -178,106 +287,66 @@ class Encoder:
         view["@channel"] = self.channel_id
         for path, value in self._constants.items():
             _set(view, path, value)
-        self._cache[texts] = dtype, record
-        return dtype, record
+        form = self._cache[texts] = Form(
+            dtype, record, _fields(dtype, self._root + self.schema.stamp, self.bindings)
+        )
+        return form
 
     def blank(self) -> bytes:
         """Return a message of this channel with every number 0."""
-        return self._plan(tuple(b"" for _ in self._text_bindings))[1][PREFIX.itemsize :].tobytes()
+        return self._plan(tuple(b"" for _ in self._text_bindings)).template[PREFIX.itemsize :].tobytes()
 
-    def encode(
+    @property
+    def even(self) -> bool:
+        """Whether all records are of one size."""
+        return not self._text_bindings
+
+    def chunk(self, size: int) -> Chunk:
+        """Return an empty chunk for about ``size`` bytes of records, which are :attr:`even`.
+
+        :meth:`release` takes its memory back: fresh memory for every chunk would cost as much as filling it.
+        """
+        try:
+            chunk = self._free.pop()
+        except IndexError:
+            return Chunk(self.record_size, max(1, size // self.record_size))
+        chunk.rows = 0
+        return chunk
+
+    def release(self, chunk: Chunk) -> None:
+        """Take back a chunk that nobody reads any more."""
+        self._free.append(chunk)
+
+    def rows(
+        self, columns: Mapping[str, NDArray[Any]], t_ns: NDArray[np.int64], t_log_ns: NDArray[np.int64]
+    ) -> Rows:
+        """Return rows for :meth:`Chunk.lay`; ``columns`` are those that :meth:`arrays` returned."""
+        return Rows(self._plan(()), columns, t_ns, t_log_ns)
+
+    def records(
         self,
         columns: Mapping[str, NDArray[Any]],
         t_ns: NDArray[np.int64],
         t_log_ns: NDArray[np.int64],
         sequence: int,
-    ) -> tuple[Bytes, NDArray[np.int64]]:
-        """Lay a block of rows into message records.
-
-        Parameters
-        ----------
-        columns : mapping
-            Column name to array, all of one length, as :meth:`arrays` returns them.
-        t_ns, t_log_ns : ndarray of int64, shape (n,)
-            Time that the message speaks of, and when it was known.
-        sequence : int
-            Sequence number of the first row.
-
-        Returns
-        -------
-        data : ndarray of uint8
-            The records, one behind the other. :meth:`release` takes the memory back.
-        offsets : ndarray of int64, shape (n,)
-            Where each record starts in ``data``.
-        """
-        n = len(t_ns)
-        if not self._text_bindings:
-            data = self._blank_records(n)
-            self._fill(
-                data[:n], self._plan(())[0], columns, t_ns, t_log_ns, np.arange(sequence, sequence + n)
-            )
-            return data[:n].reshape(-1), np.arange(n, dtype=np.int64) * data.shape[1]
+    ) -> list[bytes]:
+        """Return the record of each row, where texts make their sizes differ; see :meth:`rows`."""
         texts = list(zip(*(columns[b.column] for b in self._text_bindings), strict=True))
-        records: list[bytes] = [b""] * n
-        numbers = np.arange(sequence, sequence + n)
+        records: list[bytes] = [b""] * len(t_ns)
         rows_of: dict[tuple[bytes, ...], list[int]] = {}
         for i, text in enumerate(texts):
             rows_of.setdefault(text, []).append(i)
-        for text, rows in rows_of.items():
-            part = {k: v[rows] for k, v in columns.items()}
-            dtype, template = self._plan(text)
-            data = np.tile(template, (len(rows), 1))
-            self._fill(data, dtype, part, t_ns[rows], t_log_ns[rows], numbers[rows])
-            for i, row in zip(rows, data, strict=True):
-                records[i] = row.tobytes()
-        sizes = np.fromiter(map(len, records), np.int64, n)
-        return np.frombuffer(b"".join(records), "u1"), np.cumsum(sizes) - sizes
-
-    def _blank_records(self, n: int) -> Bytes:
-        """Return at least ``n`` records with all that is constant in them, in memory that is used again.
-
-        Fresh memory for every chunk would cost as much as filling it.
-        """
-        try:
-            data = self._free.pop()
-        except IndexError:
-            data = None
-        if data is None or len(data) < n:
-            template = self._plan(())[1]
-            data = np.empty((n, template.size), "u1")  # owns its memory: release finds it again
-            data[:] = template
-        return data
-
-    def release(self, data: Bytes) -> None:
-        """Take back what :meth:`encode` returned: nobody reads it any more."""
-        owner = data.base
-        if not self._text_bindings and owner is not None:
-            self._free.append(owner)
-
-    def _fill(
-        self,
-        data: Bytes,
-        dtype: np.dtype[Any],
-        columns: Mapping[str, NDArray[Any]],
-        t_ns: NDArray[np.int64],
-        t_log_ns: NDArray[np.int64],
-        sequence: NDArray[np.int64],
-    ) -> None:
-        """Write the numbers of a block of rows into their records."""
-        records = data.view(dtype)[:, 0]
-        # In the field's own type: a cast on the way into unaligned fields takes twice as long as a copy.
-        records["@sequence"] = sequence.astype(np.uint32)
-        records["@log"] = t_log_ns.view(np.uint64)
-        records["@publish"] = t_ns.view(np.uint64)
-        _set_time(records, self._root + self.schema.stamp, t_ns)
-        for column, kind, path in self.bindings:
-            if kind == "text":
-                continue
-            values = columns[column]
-            if kind == "time":
-                _set_time(records, path, values)
-            else:
-                _set(records, path, values)
+        for text, numbers in rows_of.items():
+            form = self._plan(text)
+            part = {b.column: columns[b.column][numbers] for b in self.bindings if b.kind != "text"}
+            rows = Rows(form, part, t_ns[numbers], t_log_ns[numbers])
+            chunk = Chunk(form.template.size, len(numbers))
+            chunk.lay(rows, 0, len(numbers), 0)
+            data = chunk.data.reshape(len(numbers), -1)
+            data.view(form.dtype)["@sequence"][:, 0] = np.array(numbers) + sequence
+            for number, record in zip(numbers, data, strict=True):
+                records[number] = record.tobytes()
+        return records
 
     def arrays(self, table: Mapping[str, pl.Series | NDArray[Any]]) -> dict[str, NDArray[Any]]:
         """Check and convert columns to what :meth:`encode` takes.
@@ -287,18 +356,14 @@ class Encoder:
         MarchaError
             A column is of the wrong type, has nulls where there is no NaN, or is out of the field's range.
         """
-        dtype, _ = self._plan(tuple(b"" for _ in self._text_bindings))
+        dtype = self._plan(tuple(b"" for _ in self._text_bindings)).dtype
         return {b.column: self._array(table[b.column], b, dtype) for b in self.bindings}
 
     def _array(self, given: pl.Series | NDArray[Any], binding: Binding, dtype: np.dtype[Any]) -> NDArray[Any]:
         where = f"{self.topic}: column {binding.column!r}"
         kind = binding.kind
         if isinstance(given, np.ndarray):  # a series would be a copy
-            if (
-                given.dtype == np.float64
-                and kind == "number"
-                and _field_type(dtype, binding.path).kind == "f"
-            ):
+            if given.dtype == np.float64 and kind == "number" and _field(dtype, binding.path)[0].kind == "f":
                 return given
             if given.dtype == np.bool_ and kind == "flag":
                 return given
@@ -313,7 +378,7 @@ class Encoder:
         else:
             _refuse(where, of, of.is_numeric(), "a number")
         if kind in ("number", "sigma"):
-            field = _field_type(dtype, binding.path)
+            field, _ = _field(dtype, binding.path)
             if field.kind == "f":
                 values = series.cast(pl.Float64).to_numpy()
                 return np.square(values) if kind == "sigma" else values
@@ -323,7 +388,7 @@ class Encoder:
                 f"{where}: {series.null_count()} nulls, and {of} has no NaN; drop or fill these rows"
             )
         if kind == "number":
-            return _integers(series.to_numpy(), _field_type(dtype, binding.path), where)
+            return _integers(series.to_numpy(), _field(dtype, binding.path)[0], where)
         if kind == "flag":
             return _flags(series, where)
         if kind == "time":
@@ -354,7 +419,7 @@ def _integers(values: NDArray[Any], field: np.dtype[Any], where: str) -> NDArray
         raise MarchaError(
             f"{where}: values {values.min()} to {values.max()}, the field holds {info.min} to {info.max}"
         )
-    return values
+    return values.astype(field)
 
 
 def _flags(series: pl.Series, where: str) -> NDArray[Any]:
@@ -421,10 +486,14 @@ def record_dtype(layout: Layout) -> np.dtype[Any]:
     )
 
 
-def _field_type(dtype: np.dtype[Any], path: str) -> np.dtype[Any]:
+def _field(dtype: np.dtype[Any], path: str) -> tuple[np.dtype[Any], int]:
+    """Return the type of a field or of one element of it, and where it lies."""
     fields: Any = dtype.fields
+    if path in fields:
+        return fields[path][:2]
     base, index = split_index(path)
-    return fields[path if path in fields else base if index is not None else path][0].base
+    of, at = fields[base][:2]
+    return of.base, at + (index or 0) * of.base.itemsize
 
 
 def _set(records: NDArray[Any], path: str, values: Any) -> None:
@@ -435,10 +504,29 @@ def _set(records: NDArray[Any], path: str, values: Any) -> None:
         records[base][..., index] = values
 
 
-def _set_time(records: NDArray[Any], path: str, t_ns: NDArray[np.int64]) -> None:
-    seconds = t_ns // SECOND  # np.divmod takes several times as long
-    records[f"{path}.sec"] = seconds.astype(np.int32)
-    records[f"{path}.nanosec"] = (t_ns - seconds * SECOND).astype(np.uint32)
+def index_of(log: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the index of records of these sizes, one behind the other; see :meth:`Encoder.encode`."""
+    return np.column_stack((log, np.cumsum(sizes) - sizes))
+
+
+def _fields(dtype: np.dtype[Any], stamp: str, bindings: Sequence[Binding]) -> list[tuple[int, str, int, int]]:
+    """Return :attr:`Form.fields`."""
+    fields: Any = dtype.fields
+    out = [(TIME, "", 0, fields[f"{stamp}.sec"][1])]
+    for binding in bindings:
+        if binding.kind == "text":
+            continue
+        if binding.kind == "time":
+            out.append((TIME, binding.column, 0, fields[f"{binding.path}.sec"][1]))
+            continue
+        field, at = _field(dtype, binding.path)
+        if field == np.float32:
+            out.append((NARROWED, binding.column, 0, at))
+        elif field.itemsize in (4, 8) and not field.shape:
+            out.append((WORD if field.itemsize == 8 else HALF, binding.column, 0, at))
+        else:
+            out += [(OCTET, binding.column, k, at + k) for k in range(field.itemsize)]
+    return sorted(out)
 
 
 # ---------------------------------------------------------------------------------------- messages to tables

@@ -10,7 +10,7 @@ from mcap.records import Channel
 
 from .annotations import EventDecoder
 from .chunks import ChunkError, ChunkRef, chunk_head, read_chunk, read_index, split
-from .codec import PREFIX, Messages
+from .codec import PREFIX, Messages, index_of
 from .errors import MarchaError, UsageError
 from .mcapfile import McapFile, Packed, pack, seal
 
@@ -92,7 +92,7 @@ def _verbatim(rec: Recording, ref: ChunkRef) -> Packed | None:
         at += 9 + int.from_bytes(indexes[at + 1 : at + 9], "little")
     return Packed(
         (record,),
-        indexes,
+        (indexes,),
         channels,
         ref.first_ns,
         ref.last_ns,
@@ -118,7 +118,8 @@ def _relay(messages: Messages, channel_id: int, level: int | None) -> Packed:
     starts = messages.offsets - PREFIX.itemsize
     sizes = messages.sizes + PREFIX.itemsize
     data = np.concatenate([messages.data[i : i + n] for i, n in zip(starts, sizes, strict=True)])
-    offsets = np.cumsum(sizes) - sizes
+    index = index_of(messages.log, sizes)
+    offsets = index[:, 1]
     data[offsets + 9] = channel_id & 0xFF
     data[offsets + 10] = channel_id >> 8
-    return pack(data, channel_id, messages.log, offsets, level)
+    return pack(data, channel_id, index, level)

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from .atomic import AtomicFile
 from .cdr import Bytes
-from .checksum import crc32
+from .checksum import crc32, crc32_behind
 from .errors import UsageError
 from .threads import helpers
 
@@ -59,26 +59,37 @@ def library_name() -> str:
 
 
 class Packed(NamedTuple):
-    """A chunk ready for the file: its record (in pieces), its message indexes, and for each channel where its
-    index starts in them and how many messages it has. ``written`` is called when the pieces may be used
-    again.
+    """A chunk ready for the file: its record and its message indexes (in pieces), and for each channel where
+    its index starts in them and how many messages it has. ``crc`` is that of the record's last piece, where
+    it is known; ``written`` is called when the pieces may be used again.
     """
 
     chunk: Sequence[bytes | memoryview]
-    indexes: bytes
+    indexes: Sequence[bytes | memoryview]
     channels: dict[int, tuple[int, int]]
     first_ns: int
     last_ns: int
     compression: str
     compressed_size: int
     uncompressed_size: int
-    written: Callable[[], object] = lambda: None
+    crc: int | None = None
+    written: Callable[[], object] | None = None
 
 
 class McapFile:
-    """Writes the records of one file in order and keeps account of them for the summary."""
+    """Writes the records of one file in order and keeps account of them for the summary.
 
-    def __init__(self, path: Path, *, overwrite: bool) -> None:
+    Parameters
+    ----------
+    path : pathlib.Path
+        The file.
+    overwrite : bool
+        Whether it may be there already.
+    threads : bool
+        Whether chunks are worth worker threads, as they are when they are compressed.
+    """
+
+    def __init__(self, path: Path, *, overwrite: bool, threads: bool) -> None:
         self.path = path
         self.schemas: dict[tuple[str, str, bytes], Schema] = {}
         self.channels: dict[int, Channel] = {}
@@ -89,7 +100,7 @@ class McapFile:
         self._metadata: dict[str, MetadataIndex] = {}
         self._crc = 0
         self._at = 0
-        self._pool = helpers("write")
+        self._pool = helpers("write", 4 if threads else 0)
         self._jobs: deque[Future[Packed]] = deque()
         try:
             self._write(MCAP0_MAGIC)
@@ -149,11 +160,12 @@ class McapFile:
     def put(self, packed: Packed) -> None:
         """Write a chunk and its message indexes."""
         start = self._at
-        for piece in packed.chunk:
-            self._write(piece)
-        packed.written()
+        *head, body = packed.chunk
+        self._count(*head)
+        self._count(body, crc=packed.crc)
         index_at = self._at
-        self._write(packed.indexes)
+        self._count(*packed.indexes)
+        self._file.write(*packed.chunk, *packed.indexes, written=packed.written)
         self._chunks.append(
             ChunkIndex(
                 chunk_length=index_at - start,
@@ -161,7 +173,7 @@ class McapFile:
                 compression=packed.compression,
                 compressed_size=packed.compressed_size,
                 message_end_time=packed.last_ns,
-                message_index_length=len(packed.indexes),
+                message_index_length=self._at - index_at,
                 message_index_offsets={c: index_at + at for c, (at, _) in packed.channels.items()},
                 message_start_time=packed.first_ns,
                 uncompressed_size=packed.uncompressed_size,
@@ -223,9 +235,14 @@ class McapFile:
         self._write(builder.end())
 
     def _write(self, data: bytes | memoryview) -> None:
+        self._count(data)
         self._file.write(data)
-        self._crc = crc32(data, self._crc)
-        self._at += len(data)
+
+    def _count(self, *pieces: bytes | memoryview, crc: int | None = None) -> None:
+        """Keep account of bytes that are written now; ``crc`` is their own, where it is known."""
+        for data in pieces:
+            self._crc = crc32(data, self._crc) if crc is None else crc32_behind(self._crc, data, crc)
+            self._at += len(data)
 
 
 _local = threading.local()
@@ -251,9 +268,9 @@ def _compressor(level: int) -> zstandard.ZstdCompressor:
 def pack(
     data: Bytes,
     channel_id: int,
-    log: NDArray[np.int64],
-    offsets: NDArray[np.int64],
+    index: NDArray[np.int64],
     level: int | None = ZSTD_LEVEL,
+    written: Callable[[], object] | None = None,
 ) -> Packed:
     """Compress message records of one channel into a chunk and build its message index.
 
@@ -263,27 +280,29 @@ def pack(
         Message records, one behind the other.
     channel_id : int
         Their channel.
-    log, offsets : ndarray of int64, shape (n,)
+    index : ndarray of int64, shape (n, 2)
         Log time and first byte of every record.
     level : int or None
         Compression level of zstd; None does not compress.
+    written : callable, optional
+        Called when ``data`` and ``index`` may be used again.
     """
     raw = data.data
-    first, last = int(log.min()), int(log.max())
-    pieces, compression = seal(raw, first, last, crc32(raw), level)
-    entries = np.empty((len(log), 2), "<u8")
-    entries[:, 0] = log
-    entries[:, 1] = offsets
-    index_head = _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + entries.nbytes, channel_id, entries.nbytes)
+    first, last = int(index[:, 0].min()), int(index[:, 0].max())
+    crc = crc32(raw)
+    pieces, compression = seal(raw, first, last, crc, level)
+    entries = np.ascontiguousarray(index, "<i8").reshape(-1).view(np.uint8).data
     return Packed(
         pieces,
-        b"".join((index_head, entries.data)),
-        {channel_id: (0, len(log))},
+        (_INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(entries), channel_id, len(entries)), entries),
+        {channel_id: (0, len(index))},
         first,
         last,
         compression,
         len(pieces[-1]),
         data.size,
+        crc if level is None else None,
+        written,
     )
 
 

@@ -29,9 +29,9 @@ def helpers(name: str, most: int = 4) -> Executor:
     name : str
         Names the threads ``marcha-<name>``.
     most : int
-        Most threads that this work can use.
+        Most threads that this work can use; 0 where it is too little for any.
     """
-    if threads() == 1:
+    if most == 0 or threads() == 1:
         return _Here()
     return ThreadPoolExecutor(min(most, threads()), thread_name_prefix=f"marcha-{name}")
 

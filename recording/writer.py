@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -16,11 +16,13 @@ from mcap.records import Channel
 from numpy.typing import NDArray
 
 from .annotations import EVENT, TOPIC, check_annotations, encode_events
-from .codec import Encoder, check_times
+from .codec import Chunk, Encoder, check_times, index_of
 from .definitions import full_text
 from .errors import MarchaError, UsageError
 from .mcapfile import CHUNK_SIZE, ZSTD_LEVEL, McapFile, Packed, pack
 from .schemas import find_schema
+
+Times = NDArray[np.int64]
 
 if TYPE_CHECKING:
     from .reader import Recording
@@ -53,8 +55,8 @@ class _Output:
     metadata: dict[str, str]
     encoder: Encoder | None = None
     columns: tuple[str, ...] = ()
-    pending: list[dict[str, NDArray[Any]]] = field(default_factory=list)
-    rows: int = 0
+    chunk: Chunk | None = None
+    records: list[tuple[int, bytes]] = field(default_factory=list)
     sequence: int = 0
     last_log: int = -1
 
@@ -69,7 +71,7 @@ class Writer:
     def __init__(self, path: Path | str, *, overwrite: bool = False, level: int | None = ZSTD_LEVEL) -> None:
         self.path = Path(path)
         self._level = level
-        self._file = McapFile(self.path, overwrite=overwrite)
+        self._file = McapFile(self.path, overwrite=overwrite, threads=level is not None)
         self._outputs: dict[str, _Output] = {}
         self._annotations: list[pl.DataFrame] = []
         self._closed = False
@@ -194,7 +196,7 @@ class Writer:
         except MarchaError as e:
             raise MarchaError(f"{self.path}: {e}") from None
         out.last_log = int(log[-1])
-        self._buffer(out, out.encoder, {"t_ns": t_ns, "t_log_ns": log, **arrays})
+        self._put(out, out.encoder, arrays, t_ns, log)
 
     def add_annotations(self, table: pl.DataFrame) -> None:
         """Add labelled intervals; may be called again.
@@ -280,7 +282,7 @@ class Writer:
             for out in self._outputs.values():
                 if out.encoder is None:
                     raise UsageError(f"{self.path}: {out.topic}: declared without columns and never written")
-                self._flush(out, out.encoder)
+                self._flush(out)
             if self._annotations:
                 self._put_annotations(pl.concat(self._annotations))
             self._file.finish()
@@ -325,30 +327,44 @@ class Writer:
             raise MarchaError(f"{where}: column {name!r} must be there, Int64, without nulls")
         return check_times(values, f"{where}: {name}")
 
-    def _buffer(self, out: _Output, encoder: Encoder, block: dict[str, NDArray[Any]]) -> None:
-        """Cut rows into chunks; keep less than a chunk for the next call."""
-        rows, size, at = len(block["t_ns"]), max(1, CHUNK_SIZE // encoder.record_size), 0
-        while at < rows:
-            take = min(rows - at, size - out.rows)
-            part = {k: v[at : at + take] for k, v in block.items()}
-            at += take
-            if take == size:  # a whole chunk straight from the table
-                self._submit(out, encoder, part)
-                continue
-            out.pending.append({k: v.copy() for k, v in part.items()})  # do not hold on to the caller's table
-            out.rows += take
-            if out.rows == size:
-                self._flush(out, encoder)
+    def _put(
+        self, out: _Output, encoder: Encoder, arrays: dict[str, NDArray[Any]], t_ns: Times, log: Times
+    ) -> None:
+        """Lay rows into chunks; keep a chunk that is not full for the next call."""
+        if not encoder.even:
+            records = encoder.records(arrays, t_ns, log, out.sequence)
+            out.sequence += len(records)
+            self._gather(out, zip(log.tolist(), records, strict=True))
+            return
+        rows, at = encoder.rows(arrays, t_ns, log), 0
+        while at < len(log):
+            chunk = out.chunk = out.chunk or encoder.chunk(CHUNK_SIZE)
+            n = min(len(log) - at, chunk.most - chunk.rows)
+            chunk.lay(rows, at, n, out.sequence)
+            at += n
+            out.sequence += n
+            if chunk.rows == chunk.most:
+                self._flush(out)
 
-    def _flush(self, out: _Output, encoder: Encoder) -> None:
-        if out.rows:
-            block = {k: np.concatenate([p[k] for p in out.pending]) for k in out.pending[0]}
-            out.pending, out.rows = [], 0
-            self._submit(out, encoder, block)
+    def _gather(self, out: _Output, records: Iterable[tuple[int, bytes]]) -> None:
+        """Collect records of different sizes, given with their log times, to chunks."""
+        size = sum(len(r) for _, r in out.records)
+        for record in records:
+            out.records.append(record)
+            size += len(record[1])
+            if size >= CHUNK_SIZE:
+                self._flush(out)
+                size = 0
 
-    def _submit(self, out: _Output, encoder: Encoder, block: dict[str, NDArray[Any]]) -> None:
-        self._file.submit(_lay, encoder, block, out.sequence, self._level)
-        out.sequence += len(block["t_ns"])
+    def _flush(self, out: _Output) -> None:
+        chunk, records = out.chunk, out.records
+        if chunk is not None:
+            assert out.encoder is not None
+            release = partial(out.encoder.release, chunk)
+            self._file.submit(pack, chunk.data, out.id, chunk.index, self._level, release)
+        if records:
+            self._file.submit(pack_records, records, out.id, self._level)
+        out.chunk, out.records = None, []
 
     def _put_annotations(self, table: pl.DataFrame) -> None:
         for (tier,), rows in table.group_by("tier", maintain_order=True):
@@ -360,27 +376,9 @@ class Writer:
             self._file.add_channel(
                 Channel(id_, topic, "cdr", {"offered_qos_profiles": qos_profile(topic)}, schema)
             )
-            events = encode_events(rows.sort("start_ns", maintain_order=True), id_)
-            batch: list[tuple[int, bytes]] = []
-            size = 0
-            for event in events:
-                batch.append(event)
-                size += len(event[1])
-                if size >= CHUNK_SIZE:
-                    self._file.submit(pack_records, batch, id_, self._level)
-                    batch, size = [], 0
-            if batch:
-                self._file.submit(pack_records, batch, id_, self._level)
-
-
-def _lay(encoder: Encoder, block: dict[str, NDArray[Any]], sequence: int, level: int | None) -> Packed:
-    """Lay one block of rows into a chunk; runs in a worker thread."""
-    data, offsets = encoder.encode(block, block["t_ns"], block["t_log_ns"], sequence)
-    packed = pack(data, encoder.channel_id, block["t_log_ns"], offsets, level)
-    if level is not None:
-        encoder.release(data)
-        return packed
-    return packed._replace(written=partial(encoder.release, data))
+            out = _Output(id_, topic, EVENT, "", {})
+            self._gather(out, encode_events(rows.sort("start_ns", maintain_order=True), id_))
+            self._flush(out)
 
 
 def pack_records(records: Sequence[tuple[int, bytes]], channel_id: int, level: int | None) -> Packed:
@@ -388,4 +386,4 @@ def pack_records(records: Sequence[tuple[int, bytes]], channel_id: int, level: i
     sizes = np.array([len(r) for _, r in records])
     data = np.frombuffer(b"".join(r for _, r in records), "u1")
     log = np.array([t for t, _ in records], np.int64)
-    return pack(data, channel_id, log, np.cumsum(sizes) - sizes, level)
+    return pack(data, channel_id, index_of(log, sizes), level)

@@ -201,8 +201,12 @@ class Engine:
         self._batches: Iterator[Batch] | None = None
         self._exhausted = False
         self._checkpoints = [self._checkpoint(self._position_ns)]
-        for sink in self.sinks:
-            sink.open(self.plan)
+        try:
+            for sink in self.sinks:
+                sink.open(self.plan)
+        except BaseException:
+            self._close_sinks(None)
+            raise
 
     # -- use -----------------------------------------------------------------------------------------
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import queue
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -11,10 +9,10 @@ import polars as pl
 
 from ..recording import create
 from .blocks import Block
-from .plan import Plan
+from .plan import Plan, PlannedChannel
 
 if TYPE_CHECKING:
-    from ..recording import Recording
+    from ..recording import Recording, Writer
     from .engine import ReplayResult
 
 
@@ -89,7 +87,7 @@ class TableSink:
 
 
 class RecordingSink:
-    """Writes a recording, in a thread of its own.
+    """Writes a recording; the file itself is written in the background.
 
     Parameters
     ----------
@@ -107,80 +105,49 @@ class RecordingSink:
         self.raw = recording is None
         self._recording = recording
         self._overwrite = overwrite
-        self._queue: queue.Queue[tuple[str, Block] | ReplayResult | None] = queue.Queue(8)
-        self._error: BaseException | None = None
-        self._thread: threading.Thread | None = None
-        self._plan: Plan | None = None
-        self._ended = False
+        self._out: Writer | None = None
+        self._channels: dict[str, PlannedChannel] = {}
 
     def open(self, plan: Plan) -> None:
-        """Start the writing thread."""
-        self._plan = plan
-        self._thread = threading.Thread(target=self._run, daemon=True, name="replay writer")
-        self._thread.start()
-
-    def write(self, topic: str, table: pl.DataFrame) -> None:
-        """Queue a table; raises what went wrong in writing earlier ones."""
-        self.write_block(topic, Block(table))
-
-    def write_block(self, topic: str, block: Block) -> None:
-        """Queue a block; raises what went wrong in writing earlier ones."""
-        self._check()
-        self._queue.put((topic, block))
-
-    def close(self, result: ReplayResult | None) -> None:
-        """Write what is left and the lineage, and put the recording in place; without a result drop it."""
-        if self._thread is None:
-            return
-        self._queue.put(result)
-        self._thread.join()
-        self._thread = None
-        self._check()
-
-    def _check(self) -> None:
-        if self._error is not None:
-            error, self._error = self._error, None
-            raise error
-
-    def _run(self) -> None:
+        """Copy the input's channels and declare those of the runs."""
+        self._channels = plan.channels
+        self._out = create(self.path, overwrite=self._overwrite, level=LEVEL)
         try:
-            self._write_all()
-        except _Dropped:
-            pass
-        except BaseException as error:  # handed to the engine's thread
-            self._error = error
-            while (
-                not self._ended
-            ):  # the engine must not wait for room in the queue until it learns of the error
-                self._ended = not isinstance(self._queue.get(), tuple)
-
-    def _write_all(self) -> None:
-        assert self._plan is not None
-        channels = self._plan.channels
-        with create(self.path, overwrite=self._overwrite, level=LEVEL) as out:
             if self._recording is not None:
-                out.copy_from(self._recording)
-            for channel in channels.values():
+                self._out.copy_from(self._recording)
+            for channel in self._channels.values():
                 if channel.run or self.raw:
-                    out.add_channel(
+                    self._out.add_channel(
                         channel.topic,
                         channel.schema,
                         frame_id=channel.frame_id,
                         columns=channel.columns,
                         metadata=dict(channel.metadata),
                     )
-            while isinstance(item := self._queue.get(), tuple):
-                topic, block = item
-                channel = channels[topic]
-                out.add_table(topic, channel.schema, block.rows, frame_id=channel.frame_id)
-            self._ended = True
-            if item is None:
-                raise _Dropped
-            for run in item.runs:
+        except BaseException:
+            self._out.abort()
+            raise
+
+    def write(self, topic: str, table: pl.DataFrame) -> None:
+        """Write a table; raises what went wrong with it or earlier ones."""
+        self.write_block(topic, Block(table))
+
+    def write_block(self, topic: str, block: Block) -> None:
+        """Write a block; raises what went wrong with it or earlier ones."""
+        assert self._out is not None
+        channel = self._channels[topic]
+        self._out.add_table(topic, channel.schema, block.rows, frame_id=channel.frame_id)
+
+    def close(self, result: ReplayResult | None) -> None:
+        """Write the lineage and put the recording in place; without a result drop it."""
+        if self._out is None:
+            return
+        out, self._out = self._out, None
+        if result is None:
+            out.abort()
+            return
+        with out:
+            for run in result.runs:
                 out.add_metadata(f"run/{run.run}", run.lineage)
                 if run.annotations.height:
                     out.add_annotations(run.annotations)
-
-
-class _Dropped(Exception):
-    """The replay failed: the writer's block ends by an exception, so that nothing remains."""

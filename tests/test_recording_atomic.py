@@ -182,6 +182,7 @@ def test_a_large_file_goes_to_disk_while_it_is_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     synced: list[int] = []
+    monkeypatch.setenv("MARCHA_THREADS", "1")  # each write is through before the next
     monkeypatch.setattr("marcha.recording.atomic.SYNC_BYTES", 100)
     monkeypatch.setattr("os.fsync", synced.append)
     file = AtomicFile(tmp_path / "a")
