@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import msgspec
@@ -42,6 +44,16 @@ def test_lists_of_parameters_span_a_grid(tmp_path: Path) -> None:
 def test_presets_of_an_estimator_are_variants(tmp_path: Path) -> None:
     grid = methods(parse(MINIMAL + 'presets = ["", "tuned"]', tmp_path))
     assert [(m.label, m.preset) for m in grid] == [("foot.naive", ""), ("foot.naive tuned", "tuned")]
+
+
+def test_a_configuration_is_read_without_importing_its_estimators() -> None:
+    code = """if True:
+        import sys
+        from marcha.replay.study import load
+        load("foot-simulated")
+        print([m for m in sys.modules if m.startswith(("numba", "marcha.algorithms.foot"))])"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 def test_a_detector_may_be_a_preset_that_sets_one(tmp_path: Path) -> None:

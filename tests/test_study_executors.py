@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import pytest
 from marcha.recording import MarchaError, UsageError
+from marcha.replay.study import executors
 from marcha.replay.study.executors import SINGLE_THREAD, Executor
 
 
@@ -70,6 +72,18 @@ def test_what_is_to_be_done_meanwhile_is_done_once(workers: int, tasks: list[int
 def test_a_pool_that_was_warmed_up_and_not_used_closes() -> None:
     with Executor(2) as executor:
         executor.warm_up(["marcha.recording"], ["foot.naive", "no.such.estimator"])
+
+
+def test_a_pool_that_is_still_loading_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "endless.py").write_text("import signal\nsignal.pause()\n", encoding="utf-8")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    executors._stop_server()  # one that an earlier test left is loaded already
+    with Executor(2) as executor:
+        executor.warm_up(["endless"], [])
+    with Executor(2) as executor:
+        assert dict(executor.run(double, [1, 2])) == {1: 2, 2: 4}
 
 
 def test_no_workers_are_refused() -> None:

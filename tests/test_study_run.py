@@ -20,7 +20,7 @@ from marcha.ingest.simulate import simulate
 from marcha.recording import UsageError
 from marcha.recording import open as open_recording
 from marcha.replay import replay
-from marcha.replay.study import StudyConfig, StudyResult, figures, plan, run_study
+from marcha.replay.study import StudyConfig, StudyResult, gallery, plan, run_study
 from marcha.replay.study import study as study_module
 from marcha.replay.study.cells import cached
 from marcha.replay.study.config import Recordings
@@ -78,14 +78,14 @@ def fixed_code() -> Iterator[None]:
 @pytest.fixture
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out what takes longest, where it is not what is tested."""
-    monkeypatch.setattr(figures, "drawings", lambda *_: [])
+    monkeypatch.setattr(gallery, "drawings", lambda *_: [])
 
 
 @pytest.fixture
 def two_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Draw as few figures as show that the processes draw them."""
-    every = figures.drawings
-    monkeypatch.setattr(figures, "drawings", lambda *a: every(*a)[:2])
+    every = gallery.drawings
+    monkeypatch.setattr(gallery, "drawings", lambda *a: every(*a)[:2])
 
 
 @pytest.fixture(scope="module")

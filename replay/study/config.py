@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections import Counter
 from collections.abc import Iterator
 from fnmatch import fnmatchcase
 from importlib import resources
@@ -361,9 +362,8 @@ def check(config: StudyConfig, name: str) -> StudyConfig:
                 raise no(f"{e.name}: parameter {key} has an empty list of values")
         if "detector" in e.params and (config.detectors or e.detectors):
             raise no(f"{e.name}: give `detector` either in params or in `detectors`")
-    grid = methods(config)
-    for key in (method_id(m) for m in grid):
-        if sum(method_id(m) == key for m in grid) > 1:
+    for key, count in Counter(method_id(m) for m in _grid(config)).items():
+        if count > 1:
             raise no(f"{key[0]} with detector {key[1]!r} occurs twice; give one of them another label")
     titles = [metric_title(m) for m in config.metrics]
     for title in titles:
@@ -389,14 +389,21 @@ def method_id(method: Method) -> tuple[str, str]:
 
 def methods(config: StudyConfig) -> list[Method]:
     """Return every estimator × preset × parameters × detector, in the order of the configuration."""
-    return [m for e in config.estimators for m in _grid(e, config.detectors)]
+    return [
+        m
+        if "detector" in m.params
+        else msgspec.structs.replace(m, params={**m.params, **_choice(m.estimator, m.detector)})
+        for m in _grid(config)
+    ]
 
 
-def _grid(entry: Estimators, detectors: list[str]) -> Iterator[Method]:
-    axes = {k: v if isinstance(v, list) else [v] for k, v in entry.params.items()}
-    varying = [k for k, v in axes.items() if len(v) > 1]
-    for preset in entry.presets or [""]:
-        for values in itertools.product(*axes.values()):
+def _grid(config: StudyConfig) -> Iterator[Method]:
+    """Yield the methods before their detectors are looked up, which would import the estimators."""
+    for entry in config.estimators:
+        axes = {k: v if isinstance(v, list) else [v] for k, v in entry.params.items()}
+        varying = [k for k, v in axes.items() if len(v) > 1]
+        detectors = (config.detectors if entry.detectors is None else entry.detectors) or [""]
+        for preset, values in itertools.product(entry.presets or [""], itertools.product(*axes.values())):
             params = dict(zip(axes, values, strict=True))
             label = " ".join(
                 [
@@ -405,12 +412,8 @@ def _grid(entry: Estimators, detectors: list[str]) -> Iterator[Method]:
                     *(f"{k}={params[k]}" for k in varying if k != "detector"),
                 ]
             )
-            if "detector" in params:
-                yield Method(entry.name, label, str(params["detector"]), preset, params)
-                continue
-            chosen = detectors if entry.detectors is None else entry.detectors
-            for detector in chosen or [""]:
-                yield Method(entry.name, label, detector, preset, {**params, **_choice(entry.name, detector)})
+            for detector in [str(params["detector"])] if "detector" in params else detectors:
+                yield Method(entry.name, label, detector, preset, params)
 
 
 def _choice(estimator: str, detector: str) -> dict[str, Any]:

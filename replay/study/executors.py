@@ -8,12 +8,13 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, TypeVar
 
 from ...recording import MarchaError, UsageError
@@ -225,6 +226,8 @@ class _Pool:
             for future in self._make_workers():
                 future.result()
         except BaseException as error:  # raised again where the pool is used
+            for process in (self._pool._processes or {}).values():  # the server may have died between two
+                process.kill()
             self._started.set_exception(error)
         else:
             self._started.set_result(None)
@@ -235,9 +238,23 @@ class _Pool:
         return self._pool.submit(function, *arguments)
 
     def shutdown(self) -> None:
-        """Wait for the running tasks and end the processes."""
+        """Wait for the running tasks and end the processes; not for what they are still loading."""
+        if not self._started.done():
+            _stop_server()
         self._started.exception()
         self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _stop_server() -> None:
+    """End the server that processes are forked from, if there is one; the next pool starts another."""
+    if "multiprocessing.forkserver" in sys.modules:
+        from multiprocessing import forkserver
+
+        server: Any = forkserver._forkserver  # pyright: ignore[reportAttributeAccessIssue]
+        if server._forkserver_pid is not None:
+            with suppress(ProcessLookupError):
+                os.kill(server._forkserver_pid, signal.SIGKILL)
+            server._stop()  # waits for it: it must not be taken for a living one
 
 
 def _one_by_one(function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outcome[T, R]]:

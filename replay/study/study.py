@@ -21,6 +21,7 @@ from . import analysis, plan
 from . import config as cfg
 from .cells import Cell, Makers, cached, failed, run_task
 from .executors import Executor
+from .gallery import draw
 from .report import Material, Picture, render
 from .store import CellStore, tidy, write_atomic
 
@@ -163,25 +164,26 @@ def run_study(
     roots = [Path(p) for p in ([data] if isinstance(data, str | Path) else data or ([base] if base else []))]
     folder = Path(out_dir)
     toml = msgspec.toml.encode(_plain(config)).decode()
-    methods = cfg.methods(config)
-    code = plan.code_digest(m.estimator for m in methods)
-    plan.check_methods(methods)
-    sources, notes = plan.find_sources(config, (roots[0] if len(roots) == 1 else roots) or None, code)
-    _claim(folder, toml, overwrite=overwrite, resume=resume)
-
-    store = CellStore(folder / "cells")
-    finished = store.load()
-    wanted = [(source, job) for source in sources for job in plan.jobs(config, source)]
-    reused = {job.key for _, job in wanted} & finished.keys()
+    makers = Makers(convert, simulate)
     with Executor(workers, scheduler) as executor:
+        # First of all: the processes load what they need while this one looks for mistakes and recordings.
+        executor.warm_up(makers.modules, [e.name for e in config.estimators])
+        methods = cfg.methods(config)
+        code = plan.code_digest(m.estimator for m in methods)
+        plan.check_methods(methods)
+        sources, notes = plan.find_sources(config, (roots[0] if len(roots) == 1 else roots) or None, code)
+        _claim(folder, toml, overwrite=overwrite, resume=resume)
+
+        store = CellStore(folder / "cells")
+        finished = store.load()
+        wanted = [(source, job) for source in sources for job in plan.jobs(config, source)]
+        reused = {job.key for _, job in wanted} & finished.keys()
         todo = plan.tasks(config, sources, reused, (folder / "recordings").resolve(), executor.processes)
         total, done = len(wanted), len(wanted) - sum(len(t.jobs) for t in todo)
         if progress:
             progress(done, total)
-        makers = Makers(convert, simulate)
-        if todo:
-            executor.warm_up(makers.modules, {m.estimator for m in methods})
-            _load_libraries()  # while the processes start
+        from scipy import stats  # noqa: F401  # a second that passes here while the processes start
+
         function = partial(run_task, makers)
         for _ in executor.run(function, plan.preparations(todo)):
             pass  # what cannot be prepared fails again, and is recorded, in its own tasks
@@ -199,9 +201,6 @@ def run_study(
         values = analysis.values(results, config)
         consistency = analysis.consistency(results, config)
         tables: list[pl.DataFrame] = []
-
-        from .figures import draw
-
         pictures = draw(
             executor,
             values,
@@ -238,13 +237,6 @@ def run_study(
         notes=material.notes,
         files=files,
     )
-
-
-def _load_libraries() -> None:
-    """Import what analysis and figures need: two seconds that importing this room should not take."""
-    from scipy import stats  # noqa: F401
-
-    from . import figures  # noqa: F401
 
 
 def _plain(config: cfg.StudyConfig) -> Any:
