@@ -56,7 +56,7 @@ class Runner:
         self.blocks = blocks and not plan.offline and hasattr(self.estimator, "run_block")
         self.loop_s = 0.0
         self._stance: list[tuple[int, int]] = []
-        self._steps: list[pl.DataFrame] = []
+        self._steps: list[Columns] = []
         self._state = _State()
         self._compile()
         self._fresh = self._estimator_snapshot()
@@ -224,11 +224,10 @@ class Runner:
             if output.schema == "marcha_msgs/msg/Stance":
                 data["still"] = data["still"] > 0.5
                 self._note_stances(data["t_ns"], data["still"])
-            block = Block(data)
             if output.schema == "marcha_msgs/msg/Step":
-                block = Block(_with_swing_times(block.table))
-                self._steps.append(block.table)
-            blocks[output.name] = block
+                data = _with_swing_times(data)
+                self._steps.append(data)
+            blocks[output.name] = Block(data)
         return blocks
 
     # -- annotations ---------------------------------------------------------------------------------
@@ -264,7 +263,10 @@ class Runner:
             pl.lit("stance").alias("label"),
             pl.lit("{}").alias("metadata"),
         )
-        tables = [stances, *([_step_annotations(pl.concat(self._steps), run)] if self._steps else [])]
+        tables = [stances]
+        if self._steps:
+            steps = {name: np.concatenate([s[name] for s in self._steps]) for name in self._steps[0]}
+            tables.append(_step_annotations(pl.DataFrame(steps), run))
         return pl.concat(tables).sort("start_ns", maintain_order=True)
 
     # -- what to say -----------------------------------------------------------------------------------
@@ -311,15 +313,17 @@ def _step_annotations(steps: pl.DataFrame, run: str) -> pl.DataFrame:
     )
 
 
-def _with_swing_times(table: pl.DataFrame) -> pl.DataFrame:
+def _with_swing_times(steps: Columns) -> Columns:
     """Turn the swing's length of a step, which ends at the row's time, into its two times."""
-    if "swing_s" not in table.columns:
-        return table
-    swing_ns = (pl.col("swing_s") * 1e9).round().cast(pl.Int64)
-    return table.select(
-        "t_ns",
-        "t_log_ns",
-        (pl.col("t_ns") - swing_ns).alias("start_ns"),
-        pl.col("t_ns").alias("end_ns"),
-        *(c for c in table.columns[2:] if c != "swing_s"),
-    ).with_columns(pl.col("index").cast(pl.UInt32))
+    if "swing_s" not in steps:
+        return steps
+    t_ns = steps["t_ns"]
+    times = {"start_ns": t_ns - np.round(steps["swing_s"] * 1e9).astype(np.int64), "end_ns": t_ns}
+    rest = {name: values for name, values in steps.items() if name not in ("t_ns", "t_log_ns", "swing_s")}
+    return {
+        "t_ns": t_ns,
+        "t_log_ns": steps["t_log_ns"],
+        **times,
+        **rest,
+        "index": rest["index"].astype(np.uint32),
+    }
