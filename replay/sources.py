@@ -152,7 +152,13 @@ class RecordingSource:
     ) -> Iterator[Batch]:
         """Yield batches of these topics, log time in [start_ns, end_ns)."""
         order = [t for t in self.channels if t in set(topics)]
-        windows = self.recording.windows(order, start_ns=start_ns, end_ns=end_ns, max_rows=self.max_rows)
+        windows = self.recording.windows(
+            order,
+            start_ns=start_ns,
+            end_ns=end_ns,
+            max_rows=self.max_rows,
+            ahead=False,  # the engine has a thread for all of this
+        )
         for window in windows:
             tables = {t: window.tables[t] for t in order if t in window.tables and window.tables[t].height}
             yield Batch(window.end_ns, tables)
