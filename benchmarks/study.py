@@ -2,7 +2,8 @@
 
 What is timed is the whole command in a fresh interpreter, from its start until the study is there: imports,
 simulation, conversion, replay, evaluation, statistics, figures, report. One and two processes are treated
-alike: the same walks into an empty folder, with compiled kernels on disk, one thread a process, in turn; of
+alike: the same walks into an empty folder, with bytecode and compiled kernels on disk (an environment that
+forbids to write bytecode does not count: what is installed has it), one thread a process, in turn; of
 :data:`REPEATS` pairs the one with the median ratio counts. CPU seconds (of all processes, children included)
 stand beside the wall time: on a machine that others use, wall times of two processes suffer more than those
 of one.
@@ -29,7 +30,7 @@ def rows(scale: float) -> list[Row]:
     """Measure the preset ``foot-simulated`` with one and with two processes."""
     walks = max(1, round(WALKS * scale))
     with tempfile.TemporaryDirectory(prefix="marcha-bench-") as folder:
-        _measure(1, 1, Path(folder) / "warm")  # fills numba's caches on disk
+        _measure(1, 1, Path(folder) / "warm")  # fills the caches of bytecode and of numba on disk
         pairs = [
             [_measure(workers, walks, Path(folder) / f"{workers}-{k}") for workers in (1, 2)]
             for k in range(REPEATS)
@@ -60,7 +61,7 @@ def _measure(workers: int, walks: int, folder: Path) -> tuple[float, float]:
     cpu, begin = _children_cpu(), time.monotonic()
     done = subprocess.run(
         command,
-        env=os.environ | SINGLE_THREAD,
+        env=os.environ | SINGLE_THREAD | {"PYTHONDONTWRITEBYTECODE": ""},
         cwd=Path(__file__).resolve().parents[1],
         check=True,
         stdout=subprocess.PIPE,

@@ -41,6 +41,7 @@ DPI = 120
 STYLE: Any = {
     "font.size": 10,
     "axes.titlesize": 11,
+    "axes.titley": 1.0,  # where it would be put anyway, after a search for ticks that it might touch
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
@@ -95,7 +96,8 @@ def _box(
                 markersize=5 if small else 3,
                 alpha=0.8,
             )
-        ax.plot(position, values.mean(), "D", markersize=4, markerfacecolor="white", markeredgecolor="black")
+    means = [values.mean() for values in everything]
+    ax.plot(positions, means, "D", markersize=4, markerfacecolor="white", markeredgecolor="black")
 
 
 def _axis_label(frame: pl.DataFrame) -> str:
@@ -224,29 +226,30 @@ def qq(frame: pl.DataFrame, config: cfg.StudyConfig) -> Figure | None:
 
 def tracks(cells: Sequence[Cell], config: cfg.StudyConfig) -> Figure | None:
     """Overlaid tracks seen from above, a panel a configuration × filter."""
-    drawn = [c for c in cells if c.status == "ok" and len(c.positions) > 1]
+    drawn: dict[tuple[str, str], list[Cell]] = {}
+    for cell in cells:
+        if cell.status == "ok" and len(cell.positions) > 1:
+            drawn.setdefault((cell.label, cell.configuration), []).append(cell)
     if not drawn:
         return None
-    filters = [
-        f for f in dict.fromkeys(m.label for m in cfg.methods(config)) if any(c.label == f for c in drawn)
-    ]
-    configurations = sorted({c.configuration for c in drawn})
+    labels, configurations = {f for f, _ in drawn}, sorted({c for _, c in drawn})
+    filters = [f for f in dict.fromkeys(m.label for m in cfg.methods(config)) if f in labels]
     # One filter on many configurations goes across the page, not down.
     across = len(filters) < 3 < len(configurations)
     rows, columns = (filters, configurations) if across else (configurations, filters)
     figure = Figure(figsize=(0.8 + 2.4 * len(columns), 0.9 + 2.4 * len(rows)))
     axes = figure.subplots(len(rows), len(columns), squeeze=False, sharex=True, sharey=True)
-    ends = np.concatenate([c.positions[:, :2] for c in drawn])
+    points = np.concatenate([cell.positions[:, :2] for own in drawn.values() for cell in own])
+    points = points[~np.isnan(points).any(axis=1)]
     # A diverged track must not shrink all the others to a dot.
-    low, high = np.nanpercentile(ends, 1, axis=0), np.nanpercentile(ends, 99, axis=0)
+    low, high = np.percentile(points, (1, 99), axis=0)
     reach = 0.62 * max(float((high - low).max()), 0.5)
     middle = (low + high) / 2
     for i, row in enumerate(rows):
         for k, column in enumerate(columns):
             name, configuration = (row, column) if across else (column, row)
-            own = [c for c in drawn if c.configuration == configuration and c.label == name]
             ax = axes[i, k]
-            _overlay(ax, own, colour(filters.index(name)), middle, reach)
+            _overlay(ax, drawn.get((name, configuration), []), colour(filters.index(name)), middle, reach)
             if i == 0:
                 ax.set_title(column)
             if k == 0:
@@ -324,12 +327,13 @@ def images(draw: Callable[..., Figure | None], *arguments: Any) -> tuple[bytes, 
         if figure is None:
             return None
         figure.set_dpi(DPI)
+        canvas = FigureCanvasAgg(figure)  # there before the layout, whose text extents it remembers
         engine = figure.get_layout_engine()
         if engine is not None:  # laid out once for both formats
             engine.execute(figure)
         figure.set_layout_engine("none")
         png, svg = io.BytesIO(), io.BytesIO()
         # Not savefig: it draws everything twice.
-        FigureCanvasAgg(figure).print_png(png)
+        canvas.print_png(png)
         FigureCanvasSVG(figure).print_svg(svg, metadata={"Date": None})
     return png.getvalue(), svg.getvalue()
