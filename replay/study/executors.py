@@ -239,9 +239,9 @@ class _Pool:
 
     def shutdown(self) -> None:
         """Wait for the running tasks and end the processes; not for what they are still loading."""
-        if not self._started.done():
+        while not self._started.done():
             _stop_server()
-        self._started.exception()
+            wait([self._started], timeout=0.1)  # a thread that had not asked it yet has started another
         self._pool.shutdown(wait=True, cancel_futures=True)
 
 
