@@ -206,6 +206,7 @@ class _Pool:
         context = multiprocessing.get_context("forkserver" if served else "spawn")
         self._pool = ProcessPoolExecutor(count, context, initializer=_start_worker)
         self._count = count
+        self._own_server = served and _server_pid() is None
         with _environment(SINGLE_THREAD | {ESTIMATORS: " ".join(estimators)}):
             if served:  # its workers inherit this environment
                 from multiprocessing import forkserver
@@ -239,22 +240,31 @@ class _Pool:
 
     def shutdown(self) -> None:
         """Wait for the running tasks and end the processes; not for what they are still loading."""
-        while not self._started.done():
+        while self._own_server and not self._started.done():
             _stop_server()
             wait([self._started], timeout=0.1)  # a thread that had not asked it yet has started another
+        self._started.exception()
         self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _server() -> Any:
+    from multiprocessing import forkserver
+
+    return forkserver._forkserver  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _server_pid() -> int | None:
+    """Return the process that others are forked from, None where there is none yet."""
+    return _server()._forkserver_pid if "multiprocessing.forkserver" in sys.modules else None
 
 
 def _stop_server() -> None:
     """End the server that processes are forked from, if there is one; the next pool starts another."""
-    if "multiprocessing.forkserver" in sys.modules:
-        from multiprocessing import forkserver
-
-        server: Any = forkserver._forkserver  # pyright: ignore[reportAttributeAccessIssue]
-        if server._forkserver_pid is not None:
-            with suppress(ProcessLookupError):
-                os.kill(server._forkserver_pid, signal.SIGKILL)
-            server._stop()  # waits for it: it must not be taken for a living one
+    pid = _server_pid()
+    if pid is not None:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+        _server()._stop()  # waits for it: it must not be taken for a living one
 
 
 def _one_by_one(function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outcome[T, R]]:
