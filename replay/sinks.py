@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 
 LEVEL = None
-"""Estimates are not compressed: their low bits are noise. zstd −3 would save 40 % of their size and take as
-long as all the rest of writing them. A recording that is exported to be handed on is compressed."""
+"""Estimates are not compressed: their low bits are noise. zstd −3 would save 40 % of their size and take
+twice as long as all the rest of writing them. A recording that is exported to be handed on is compressed."""
 
 
 class Sink(Protocol):
