@@ -286,7 +286,8 @@ class Encoder:
         view["@length"] = record.size - 9
         view["@channel"] = self.channel_id
         for path, value in self._constants.items():
-            _set(view, path, value)
+            field, at = _field(dtype, path)
+            record[at : at + field.itemsize].view(field.base)[:] = value
         form = self._cache[texts] = Form(
             dtype, record, _fields(dtype, self._root + self.schema.stamp, self.bindings)
         )
@@ -349,7 +350,7 @@ class Encoder:
         return records
 
     def arrays(self, table: Mapping[str, pl.Series | NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """Check and convert columns to what :meth:`encode` takes.
+        """Check and convert columns to what :meth:`rows` and :meth:`records` take.
 
         Raises
         ------
@@ -496,16 +497,8 @@ def _field(dtype: np.dtype[Any], path: str) -> tuple[np.dtype[Any], int]:
     return of.base, at + (index or 0) * of.base.itemsize
 
 
-def _set(records: NDArray[Any], path: str, values: Any) -> None:
-    if path in (records.dtype.names or ()):
-        records[path] = values
-    else:
-        base, index = split_index(path)
-        records[base][..., index] = values
-
-
 def index_of(log: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index of records of these sizes, one behind the other; see :meth:`Encoder.encode`."""
+    """Return the index of records of these sizes, one behind the other; see :attr:`Chunk.index`."""
     return np.column_stack((log, np.cumsum(sizes) - sizes))
 
 

@@ -12,7 +12,9 @@ import numpy as np
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from .codec import HALF, NARROWED, OCTET, SECOND, TIME, WORD
+from .codec import HALF, NARROWED, OCTET, PREFIX, SECOND, TIME, WORD
+
+_SEQUENCE, _LOG, _PUBLISH = (PREFIX.fields[name][1] for name in ("sequence", "log", "publish"))  # type: ignore[index]
 
 #: Without counting references to the arrays (_nrt): numba would do that, atomically, at every call.
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False}
@@ -97,9 +99,9 @@ def lay(data, index, template, sequence, times, fields, ends, size, n):
         index[i, 0] = log
         index[i, 1] = record
         _copy(data, record, template, size)
-        _put(data, record + 11, np.int32(sequence + i))
-        _put(data, record + 15, log)
-        _put(data, record + 23, publish)
+        _put(data, record + _SEQUENCE, np.int32(sequence + i))
+        _put(data, record + _LOG, log)
+        _put(data, record + _PUBLISH, publish)
         k = 0
         while k < ends[WORD]:
             _put(data, record + fields[k, 2], _word(fields[k, 0] + i * fields[k, 1]))

@@ -101,6 +101,7 @@ class McapFile:
         self._crc = 0
         self._at = 0
         self._pool = helpers("write", 4 if threads else 0)
+        self._ahead = _QUEUE if threads else 0
         self._jobs: deque[Future[Packed]] = deque()
         try:
             self._write(MCAP0_MAGIC)
@@ -149,7 +150,9 @@ class McapFile:
     def submit(self, pack: Callable[..., Packed], *args: Any) -> None:
         """Have ``pack(*args)`` make a chunk in a worker thread; they enter the file in that order."""
         self._jobs.append(self._pool.submit(pack, *args))
-        while len(self._jobs) > _QUEUE:
+        while (
+            len(self._jobs) > self._ahead
+        ):  # a number, not what is done: the same tables give the same bytes
             self.put(self._jobs.popleft().result())
 
     def drain(self) -> None:

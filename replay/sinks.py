@@ -31,7 +31,7 @@ class Sink(Protocol):
     """
 
     def open(self, plan: Plan) -> None:
-        """Prepare for the channels of ``plan``."""
+        """Prepare for the channels of ``plan``. Where this or a later sink's fails, all are closed."""
         ...
 
     def write(self, topic: str, table: pl.DataFrame) -> None:
@@ -112,21 +112,17 @@ class RecordingSink:
         """Copy the input's channels and declare those of the runs."""
         self._channels = plan.channels
         self._out = create(self.path, overwrite=self._overwrite, level=LEVEL)
-        try:
-            if self._recording is not None:
-                self._out.copy_from(self._recording)
-            for channel in self._channels.values():
-                if channel.run or self.raw:
-                    self._out.add_channel(
-                        channel.topic,
-                        channel.schema,
-                        frame_id=channel.frame_id,
-                        columns=channel.columns,
-                        metadata=dict(channel.metadata),
-                    )
-        except BaseException:
-            self._out.abort()
-            raise
+        if self._recording is not None:
+            self._out.copy_from(self._recording)
+        for channel in self._channels.values():
+            if channel.run or self.raw:
+                self._out.add_channel(
+                    channel.topic,
+                    channel.schema,
+                    frame_id=channel.frame_id,
+                    columns=channel.columns,
+                    metadata=dict(channel.metadata),
+                )
 
     def write(self, topic: str, table: pl.DataFrame) -> None:
         """Write a table; raises what went wrong with it or earlier ones."""

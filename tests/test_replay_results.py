@@ -18,6 +18,7 @@ from marcha.replay import (
     Engine,
     LiveSource,
     ManualClock,
+    RecordingSink,
     RecordingSource,
     TableSink,
     evaluate,
@@ -211,6 +212,18 @@ def test_kernels_give_the_same_bits_after_seeks(path: Path, done: tuple[Any, Rec
     engine.play()
     engine.finish()
     assert same_bits({t: sink.table(t) for t in tables(done[0])}, tables(done[0]))  # type: ignore[misc]
+
+
+def test_a_sink_that_cannot_open_leaves_nothing_of_the_others(path: Path, tmp_path: Path) -> None:
+    class Broken(TableSink):
+        def open(self, plan: object) -> None:
+            raise MarchaError("no viewer")
+
+    source, out = RecordingSource(mr.open(path)), tmp_path / "new" / "out.mcap"
+    out.parent.mkdir()
+    with pytest.raises(MarchaError, match="no viewer"):
+        Engine(source, plan_runs(source, FOOT), sinks=[RecordingSink(out, mr.open(path)), Broken()])
+    assert not list(out.parent.iterdir())
 
 
 def test_kernels_give_the_same_bits_live(path: Path, done: tuple[Any, Recording]) -> None:
