@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..algorithms.contract import FloatArray
 from ..recording.errors import Finding, UsageError
+from .blocks import by_columns
 from .sources import Batch
 
 IntArray = NDArray[np.int64]
@@ -111,7 +112,7 @@ class Rows:
     Attributes
     ----------
     values : ndarray, shape (n, 1 + columns)
-        ``dt_s`` and the inputs' columns; estimators must not write to it.
+        ``dt_s`` and the inputs' columns, made :func:`.blocks.by_columns`; estimators must not write to it.
     t_ns, t_log_ns : ndarray of int64, shape (n,)
         Time of every row and when it was known.
     resets : tuple of int
@@ -207,24 +208,24 @@ class Feed:
         finite = np.ones(0 if table is None else table.height, bool)
         if table is None:
             times = logs = places = np.empty(0, np.int64)
-            values = np.empty((0, self.width))
+            values = by_columns(0, self.width)
         else:
             times, logs, places = (
                 table["t_ns"].to_numpy(),
                 table["t_log_ns"].to_numpy(),
                 part.positions[topic],
             )
-            values = (
-                np.full((len(times), self.width), np.nan)
-                if len(self.inputs) > 1
-                else np.empty((len(times), self.width))
-            )
+            values = by_columns(len(times), self.width)
+            values[:, 1 + len(columns) :] = np.nan
             for i, column in enumerate(columns, 1):
                 values[:, i] = given = table[column].to_numpy()
                 finite &= np.isfinite(given)
         keep, dt_s, resets = self._usable(times, finite)
         if keep is not None:
-            times, logs, places, values = times[keep], logs[keep], places[keep], values[keep]
+            times, logs, places, given = times[keep], logs[keep], places[keep], values
+            values = by_columns(len(times), self.width)
+            for i in range(1, self.width):
+                values[:, i] = given[keep, i]
         values[:, 0] = dt_s
         self._state.rows += len(times)
         first = 1 + len(columns)

@@ -13,12 +13,9 @@ import polars as pl
 
 from ..algorithms.contract import FloatArray, KernelEstimator, input_columns, output_columns
 from ..recording.errors import Finding, MarchaError
-from .blocks import Block, Columns, joined
+from .blocks import Block, Columns, by_columns, joined
 from .feed import Feed, IntArray, Rows
 from .plan import PlannedRun
-
-STRETCH = 4096
-"""Rows whose results are turned from rows to columns together: they stay in the processor's cache."""
 
 
 @dataclass
@@ -58,24 +55,9 @@ class Runner:
         self._stance: list[tuple[int, int]] = []
         self._steps: list[Columns] = []
         self._state = _State()
-        self._compile()
+        warm_up(self.estimator, self.blocks)
         self._fresh = self._estimator_snapshot()
-        self._out = np.empty((STRETCH, len(self.columns)))
         self._rows: list[tuple[FloatArray, IntArray]] = []  # of an offline estimator, the present segment
-
-    def _compile(self) -> None:
-        """Let a kernel compile (or load from its cache) before the clock of ``loop_s`` runs."""
-        width = len(input_columns(self.estimator))
-        if self.blocks:
-            self.estimator.run_block(np.empty((0, width)), np.empty((0, len(self.columns))))
-        elif isinstance(self.estimator, KernelEstimator):
-            estimator: Any = self.estimator
-            before = estimator.snapshot()
-            if self.plan.offline:
-                estimator.process(np.zeros((2, width)))
-            else:
-                estimator.step(np.zeros(width))
-            estimator.restore(before)
 
     # -- state ---------------------------------------------------------------------------------------
 
@@ -147,10 +129,7 @@ class Runner:
         if self.plan.offline:
             self._rows.append((values, t_ns))
             return {}
-        columns = np.empty((len(self.columns), len(t_ns)))
-        for a in range(0, len(t_ns), STRETCH):
-            part = values[a : a + STRETCH]
-            columns[:, a : a + STRETCH] = self._results(part).T
+        columns = self._results(values).T
         times = t_ns
         if self.latency:
             known = np.concatenate((state.recent_ns, t_ns))
@@ -168,15 +147,15 @@ class Runner:
         return self._by_output(columns, times, t_log_ns)
 
     def _results(self, rows: FloatArray) -> FloatArray:
-        """Return the result of every row, NaN where there is none; valid until the next call."""
-        out = self._out[: len(rows)]
-        out.fill(np.nan)
+        """Return the result of every row, NaN where there is none."""
+        out = by_columns(len(rows), len(self.columns))
         begin = time.perf_counter()
         if self.blocks:
             self.estimator.run_block(rows, out)
         else:
+            out[:] = np.nan
             step = self.estimator.step
-            for i, row in enumerate(rows):
+            for i, row in enumerate(np.ascontiguousarray(rows)):
                 result = step(row)
                 if result is not None:
                     out[i] = result
@@ -296,6 +275,23 @@ class Runner:
             found.append(Finding(remark.kind, 1, None, remark.detail))
             fatal |= remark.fatal
         return found, fatal
+
+
+def warm_up(estimator: Any, blocks: bool) -> None:
+    """Let a kernel compile (or load from its cache) before a clock runs; its state stays as it is."""
+    if not isinstance(estimator, KernelEstimator):
+        return
+    before = estimator.snapshot()
+    zeros = np.zeros((2, len(input_columns(estimator))))
+    if blocks:
+        rows = by_columns(*zeros.shape)
+        rows[:] = zeros
+        estimator.run_block(rows, by_columns(2, len(output_columns(estimator))))
+    elif estimator.offline:
+        estimator.process(zeros)  # type: ignore[attr-defined]
+    else:
+        estimator.step(zeros[0])
+    estimator.restore(before)
 
 
 def _step_annotations(steps: pl.DataFrame, run: str) -> pl.DataFrame:

@@ -19,13 +19,13 @@ import msgspec
 import numpy as np
 
 from ...algorithms import make
-from ...algorithms.contract import input_columns, output_columns
 from ...recording import MarchaError, OutputExists, Recording
 from ...recording import create as create_recording
 from ...recording import open as open_recording
 from ..api import replay
 from ..engine import Run
 from ..plan import NOT_RAW, EstimatorSpec
+from ..runs import warm_up
 from .plan import Job, Source, Task
 
 #: Points that are kept of a track: enough for a figure, small enough for hundreds of walks.
@@ -222,9 +222,7 @@ def chosen(rec: Recording, inputs: Sequence[str]) -> list[str] | None:
 def warm(name: str) -> None:
     """Compile an estimator or load it from numba's cache, so that no run time contains it."""
     estimator: Any = make(name)
-    if hasattr(estimator, "run_block"):
-        rows = np.zeros((2, len(input_columns(estimator))))
-        estimator.run_block(rows, np.full((2, len(output_columns(estimator))), np.nan))
+    warm_up(estimator, blocks=not getattr(estimator, "offline", False))
 
 
 def _run(rec: Recording, source: Source, jobs: Sequence[Job], topics: list[str] | None) -> list[Cell]:
