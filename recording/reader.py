@@ -445,39 +445,34 @@ class Recording:
             add_finding(self.findings, "bad_chunk", f"{detail}; skipped")
 
     def _emit(self, held: dict[str, list[Columns]], horizon: int | None, max_rows: int) -> Iterator[Window]:
-        """Yield what lies before ``horizon`` in windows of ``max_rows``; keep the rest."""
-        ready: dict[str, pl.DataFrame] = {}
-        for topic, parts in held.items():
-            if not parts:
-                continue
-            table = _join(parts)
-            at = (
-                table.height
-                if horizon is None
-                else int(table["t_log_ns"].search_sorted(horizon, side="left"))
-            )
-            ready[topic] = table.slice(0, at)
-            held[topic] = [_columns(table.slice(at))] if at < table.height else []
-        ready = {t: v for t, v in ready.items() if v.height}
-        if not ready:
+        """Yield windows of ``max_rows`` of what lies before ``horizon``; keep the rest (None: nothing)."""
+        tables = {topic: _join(parts) for topic, parts in held.items() if parts}
+        logs = {topic: table["t_log_ns"].to_numpy() for topic, table in tables.items()}
+        if not logs:
             return
-        times = np.sort(np.concatenate([t["t_log_ns"].to_numpy() for t in ready.values()]))
+        times = np.sort(np.concatenate(list(logs.values())))
+        if horizon is not None:
+            times = times[: np.searchsorted(times, horizon)]
+        if not len(times):
+            return
         cuts = [int(times[0])]
         at = 0
-        while at < len(times):
+        while at < len(times) and (horizon is None or at + max_rows <= len(times)):
             at = min(at + max_rows, len(times))
             if at < len(times):  # a window ends before a log time, never amid rows that share it
                 left = int(np.searchsorted(times, times[at], side="left"))
                 at = left if times[at] > cuts[-1] else int(np.searchsorted(times, times[at], side="right"))
             cuts.append(int(times[at]) if at < len(times) else int(times[-1]) + 1)
+        for topic, table in tables.items():
+            at = int(np.searchsorted(logs[topic], cuts[-1]))
+            held[topic] = [_columns(table.slice(at))] if at < table.height else []
         for start, end in pairwise(cuts):
-            tables = {}
-            for topic, table in ready.items():
-                log = table["t_log_ns"]
-                i, j = (int(log.search_sorted(t, side="left")) for t in (start, end))
+            window: dict[str, pl.DataFrame] = {}
+            for topic, table in tables.items():
+                i, j = np.searchsorted(logs[topic], (start, end)).tolist()
                 if j > i:
-                    tables[topic] = table.slice(i, j - i)
-            yield Window(start, end, tables)
+                    window[topic] = table.slice(i, j - i)
+            yield Window(start, end, window)
 
     def _empty(self, source: Source) -> pl.DataFrame:
         """Return a table without rows, its columns of the types that rows would have."""
