@@ -15,8 +15,14 @@ from .threads import helpers
 SYNC_BYTES = 1 << 26
 """So many bytes go to disk together, while more are being written."""
 
-_QUEUE = 16
-"""Writes that may wait for the disk: bounds memory."""
+TOGETHER_BYTES = 1 << 22
+"""So many bytes are handed to the thread that writes them together: waking it costs as much as writing 100 kB."""
+
+_QUEUE = 4
+"""Hand-overs that may wait for the disk: bounds memory."""
+
+Written = Callable[[], object]
+Pieces = tuple[bytes | memoryview, ...]
 
 
 class AtomicFile:
@@ -41,6 +47,8 @@ class AtomicFile:
         self.path = path
         self.overwrite = overwrite
         self._done = False
+        self._collected: list[tuple[Pieces, Written | None]] = []
+        self._collected_bytes = 0
         self._writer: Executor = helpers("file", 1)
         self._writing: deque[Future[None]] = deque()
         self._syncer: Executor = helpers("sync", 1)
@@ -64,7 +72,7 @@ class AtomicFile:
                 raise _failure(path, e) from None
         _lock(self._file.fileno())
 
-    def write(self, *pieces: bytes | memoryview, written: Callable[[], object] | None = None) -> None:
+    def write(self, *pieces: bytes | memoryview, written: Written | None = None) -> None:
         """Append bytes, in the background; what has come together goes to disk meanwhile.
 
         Parameters
@@ -79,20 +87,28 @@ class AtomicFile:
         MarchaError
             The disk is full or failed, now or with an earlier call; nothing is left.
         """
-        try:
-            while len(self._writing) >= _QUEUE:
-                self._writing.popleft().result()
-            self._writing.append(self._writer.submit(self._write, pieces, written))
-        except OSError as e:
-            self.abort()
-            raise _failure(self.path, e) from None
+        self._collected.append((pieces, written))
+        self._collected_bytes += sum(map(len, pieces))
+        if self._collected_bytes >= TOGETHER_BYTES:
+            try:
+                self._hand_over()
+            except OSError as e:
+                self.abort()
+                raise _failure(self.path, e) from None
 
-    def _write(self, pieces: tuple[bytes | memoryview, ...], written: Callable[[], object] | None) -> None:
-        for piece in pieces:
-            self._file.write(piece)
-            self._unsynced += len(piece)
-        if written is not None:
-            written()
+    def _hand_over(self) -> None:
+        while len(self._writing) >= _QUEUE:
+            self._writing.popleft().result()
+        self._writing.append(self._writer.submit(self._write, self._collected))
+        self._collected, self._collected_bytes = [], 0
+
+    def _write(self, collected: list[tuple[Pieces, Written | None]]) -> None:
+        for pieces, written in collected:
+            for piece in pieces:
+                self._file.write(piece)
+                self._unsynced += len(piece)
+            if written is not None:
+                written()
         if self._unsynced >= SYNC_BYTES and (self._syncing is None or self._syncing.done()):
             if self._syncing is not None:
                 self._syncing.result()
@@ -101,6 +117,7 @@ class AtomicFile:
 
     def _settle(self) -> None:
         """Wait for what is done in the background; raise what went wrong there."""
+        self._hand_over()
         while self._writing:
             self._writing.popleft().result()
         if self._syncing is not None:

@@ -149,10 +149,12 @@ class McapFile:
 
     def submit(self, pack: Callable[..., Packed], *args: Any) -> None:
         """Have ``pack(*args)`` make a chunk in a worker thread; they enter the file in that order."""
+        if self._ahead == 0:
+            self.put(pack(*args))
+            return
         self._jobs.append(self._pool.submit(pack, *args))
-        while (
-            len(self._jobs) > self._ahead
-        ):  # a number, not what is done: the same tables give the same bytes
+        # A number, not what is done: the same tables give the same bytes.
+        while len(self._jobs) > self._ahead:
             self.put(self._jobs.popleft().result())
 
     def drain(self) -> None:
