@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-import struct
-from collections.abc import Iterator
-from functools import lru_cache
+from itertools import chain
 from typing import Any
 
 import msgspec
+import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
-from .cdr import CdrError, decode
+from .cdr import Bytes, decode
 from .codec import MAX_TIME_NS, PREFIX, SECOND, Columns, Messages
 from .definitions import Library
 from .errors import MarchaError
@@ -97,45 +97,74 @@ def _metadata(value: Any) -> str:
     return _CANONICAL.encode(texts).decode()
 
 
-def encode_events(rows: pl.DataFrame, channel_id: int) -> Iterator[tuple[int, bytes]]:
-    """Yield log time and message record of every annotation of one tier."""
-    for i, (start, end, label, text) in enumerate(
-        rows.select("start_ns", "end_ns", "label", "metadata").iter_rows()
-    ):
-        try:
-            pairs = _pairs(label, text)
-        except CdrError as e:
-            raise MarchaError(f"annotations: {label!r} at {start} ns: {e}") from None
-        message = _EVENT.pack(b"\0\1\0\0", *divmod(start, SECOND), *divmod(end, SECOND)) + pairs
-        size = len(message) + PREFIX.itemsize - 9
-        yield start, _PREFIX.pack(5, size, channel_id, i, start, start) + message
+def encode_events(rows: pl.DataFrame, channel_id: int) -> tuple[Bytes, NDArray[np.int64]]:
+    """Return the message records of the annotations of one tier, one behind the other, and their index.
+
+    Raises
+    ------
+    MarchaError
+        A text contains a NUL, which a message's string cannot hold.
+    """
+    start, end = rows["start_ns"].to_numpy(), rows["end_ns"].to_numpy()
+    metadata: list[dict[str, str]] = _ALL_TEXTS.decode(f"[{','.join(rows['metadata'].to_list())}]")
+    strings: list[str] = []
+    for label, pairs in zip(rows["label"].to_list(), metadata, strict=True):
+        strings += ("label", label, *chain.from_iterable(pairs.items()))
+    counts = np.fromiter(map(len, metadata), np.int64, len(metadata)) + 1
+    first = 2 * (np.cumsum(counts) - counts)  # string of each row
+    joined = "".join(strings)
+    raw = strings if joined.isascii() else [string.encode() for string in strings]
+    lengths = np.fromiter(map(len, raw), np.int64, len(raw))
+    text = np.frombuffer(joined.encode(), np.uint8)
+    ends = np.cumsum(lengths)
+    if not text.all():
+        string = int(np.searchsorted(ends, np.argmin(text), side="right"))
+        row = int(np.searchsorted(first, string, side="right")) - 1
+        label = rows["label"][row]
+        raise MarchaError(
+            f"annotations: {label!r} at {start[row]} ns: {strings[string]!r}: a string may not contain NUL"
+        )
+    # A string is its length (with the NUL), its bytes, a NUL, and what is missing to a multiple of four,
+    # except behind the last one.
+    sizes = 4 + lengths + 1
+    padded = sizes + -sizes % 4
+    last = np.append(first[1:], len(raw)) - 1
+    padded[last] = sizes[last]
+    head = np.zeros(len(start), _HEAD)
+    taken = padded.copy()
+    taken[first] += _HEAD.itemsize
+    behind = np.cumsum(taken)
+    at = behind - padded
+    records = at[first] - _HEAD.itemsize
+    head["opcode"], head["channel"], head["sequence"] = 5, channel_id, np.arange(len(start))
+    head["length"] = behind[last] - records - 9
+    head["log"] = head["publish"] = start
+    head["encapsulation"] = b"\0\1\0\0"
+    head["start_s"], head["start_ns"] = np.divmod(start, SECOND)
+    head["end_s"], head["end_ns"] = np.divmod(end, SECOND)
+    head["pairs"] = counts
+    data = np.zeros(behind[-1], np.uint8)
+    data[records[:, None] + np.arange(_HEAD.itemsize)] = head.view(np.uint8).reshape(len(start), -1)
+    data[at[:, None] + np.arange(4)] = (lengths + 1).astype("<u4").view(np.uint8).reshape(-1, 4)
+    data[np.repeat(at + 4 - (ends - lengths), lengths) + np.arange(len(text))] = text
+    return data, np.column_stack((start, records))
 
 
-@lru_cache(maxsize=256)
-def _pairs(label: str, text: str) -> bytes:
-    """Return the key-value pairs of one event: as ``cdr.encode`` does, ten times as fast."""
-    pairs = _TEXTS.decode(text)
-    strings = ["label", label]
-    for pair in pairs.items():
-        strings += pair
-    parts = [(len(pairs) + 1).to_bytes(4, "little")]
-    for string in strings:
-        if "\0" in string:
-            raise CdrError(f"{string!r}: a string may not contain NUL")
-        raw = string.encode()
-        size = len(raw) + 1
-        parts += (size.to_bytes(4, "little"), raw, _ENDS[size % 4])
-    parts[-1] = b"\0"  # padding stands between strings, not behind the last
-    return b"".join(parts)
-
-
-_ENDS = (bytes(1), bytes(4), bytes(3), bytes(2))
-"""NUL and padding behind a string, by its length modulo 4."""
+_HEAD = np.dtype(
+    [
+        *PREFIX.descr,
+        ("encapsulation", "S4"),
+        ("start_s", "<i4"),
+        ("start_ns", "<u4"),
+        ("end_s", "<i4"),
+        ("end_ns", "<u4"),
+        ("pairs", "<u4"),
+    ]
+)
+"""What stands before the strings of an event's record."""
 _TEXTS = msgspec.json.Decoder(dict[str, str])
+_ALL_TEXTS = msgspec.json.Decoder(list[dict[str, str]])
 _CANONICAL = msgspec.json.Encoder(order="sorted")
-_EVENT = struct.Struct("<4siIiI")
-_PREFIX = struct.Struct("<BQHIQQ")
-"""``codec.PREFIX`` for one record."""
 
 
 class EventDecoder:

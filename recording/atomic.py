@@ -16,7 +16,7 @@ SYNC_BYTES = 1 << 26
 """So many bytes go to disk together, while more are being written."""
 
 TOGETHER_BYTES = 1 << 22
-"""So many bytes are handed to the thread that writes them together: waking it costs as much as writing 100 kB."""
+"""So many bytes are handed to the writing thread together: waking it costs as much as writing 100 kB."""
 
 _QUEUE = 4
 """Hand-overs that may wait for the disk: bounds memory."""

@@ -376,9 +376,15 @@ class Writer:
             self._file.add_channel(
                 Channel(id_, topic, "cdr", {"offered_qos_profiles": qos_profile(topic)}, schema)
             )
-            out = _Output(id_, topic, EVENT, "", {})
-            self._gather(out, encode_events(rows.sort("start_ns", maintain_order=True), id_))
-            self._flush(out)
+            data, index = encode_events(rows.sort("start_ns", maintain_order=True), id_)
+            ends = np.append(index[1:, 1], data.size)
+            at = 0
+            while at < len(index):
+                begin = index[at, 1]
+                n = max(1, int(np.searchsorted(ends, begin + CHUNK_SIZE, side="right")) - at)
+                part = index[at : at + n] - (0, begin)
+                self._file.submit(pack, data[begin : ends[at + n - 1]], id_, part, self._level)
+                at += n
 
 
 def pack_records(records: Sequence[tuple[int, bytes]], channel_id: int, level: int | None) -> Packed:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from ..algorithms.contract import FloatArray, KernelEstimator, input_columns, output_columns
 from ..recording.errors import Finding, MarchaError
@@ -52,7 +53,7 @@ class Runner:
         self.latency = plan.latency
         self.blocks = blocks and not plan.offline and hasattr(self.estimator, "run_block")
         self.loop_s = 0.0
-        self._stance: list[tuple[int, int]] = []
+        self._stances: list[IntArray] = []  # from, to
         self._steps: list[Columns] = []
         self._state = _State()
         warm_up(self.estimator, self.blocks)
@@ -78,7 +79,7 @@ class Runner:
         return (
             self._estimator_snapshot(),
             copy.copy(self._state),
-            len(self._stance),
+            len(self._stances),
             len(self._steps),
             list(self._rows),
         )
@@ -88,7 +89,7 @@ class Runner:
         estimator, state, stances, steps, rows = snapshot
         self._restore_estimator(estimator)
         self._state = copy.copy(state)
-        del self._stance[stances:], self._steps[steps:]
+        del self._stances[stances:], self._steps[steps:]
         self._rows = list(rows)
 
     # -- rows in, blocks out -------------------------------------------------------------------------
@@ -211,30 +212,31 @@ class Runner:
 
     # -- annotations ---------------------------------------------------------------------------------
 
-    def _note_stances(self, t_ns: IntArray, still: np.ndarray) -> None:
+    def _note_stances(self, t_ns: IntArray, still: NDArray[np.bool_]) -> None:
         """Join still samples to intervals: first to last still sample."""
         state = self._state
         before = state.still_since is not None
-        edges = np.flatnonzero(np.diff(still.astype(np.int8), prepend=np.int8(before)))
-        for edge in edges.tolist():
-            if state.still_since is None:
-                state.still_since = int(t_ns[edge])
-            else:
-                end = int(t_ns[edge - 1]) if edge else state.still_until
-                self._stance.append((state.still_since, end))
-                state.still_since = None
+        edges = np.flatnonzero(np.diff(still, prepend=before))
+        begins, after = edges[still[edges]], edges[~still[edges]]
+        since, until = t_ns[begins], t_ns[after - 1]
+        if before:
+            since = np.concatenate(([state.still_since], since))
+        if len(after) and after[0] == 0:
+            until[0] = state.still_until
+        self._stances.append(np.column_stack((since[: len(until)], until)))
+        state.still_since = int(since[-1]) if len(since) > len(until) else None
         state.still_until = int(t_ns[-1])
 
     def _close_stance(self) -> None:
         state = self._state
         if state.still_since is not None:
-            self._stance.append((state.still_since, state.still_until))
+            self._stances.append(np.array([[state.still_since, state.still_until]]))
             state.still_since = None
 
     def annotation_table(self) -> pl.DataFrame:
         """Return stances and steps as annotations of the tiers ``<run>/stance`` and ``<run>/step``."""
         run = self.plan.run
-        bounds = np.array(self._stance, np.int64).reshape(-1, 2)
+        bounds = np.concatenate([np.empty((0, 2), np.int64), *self._stances])
         stances = pl.DataFrame({"start_ns": bounds[:, 0], "end_ns": bounds[:, 1]}).select(
             pl.lit(f"{run}/stance").alias("tier"),
             "start_ns",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 
 import marcha.recording as mr
 import polars as pl
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from marcha.recording.annotations import encode_events
 from marcha.recording.cdr import encode
+from marcha.recording.codec import MAX_TIME_NS
 from marcha.recording.definitions import load
 from marcha.recording.errors import MarchaError
 from marcha.recording.integrity import structure
@@ -79,13 +81,48 @@ def test_others_see_foxglove_events(tmp_path):
 )
 def test_events_have_the_bytes_of_the_general_encoder(start, label, pairs):
     pairs.pop("label", None)
-    row = {"start_ns": [start], "end_ns": [start], "label": [label], "metadata": [json.dumps(pairs)]}
-    ((_, record),) = encode_events(pl.DataFrame(row), 1)
-    time = {"sec": start // 10**9, "nanosec": start % 10**9}
-    both = [{"key": k, "value": v} for k, v in {"label": label, **pairs}.items()]
+    rows = pl.DataFrame(
+        {
+            "start_ns": [start, start],
+            "end_ns": [start, MAX_TIME_NS],
+            "label": [label, "é" + label],
+            "metadata": [json.dumps(pairs), "{}"],
+        }
+    )
+    data, index = encode_events(rows, 7)
     library = load("foxglove_msgs/msg/Event")
-    value = {"start_time": time, "end_time": time, "metadata": both}
-    assert record[31:] == encode(value, library["foxglove_msgs/Event"], library)
+    begins = [*index[:, 1].tolist(), data.size]
+    for i, row in enumerate(rows.to_dicts()):
+        record = data[begins[i] : begins[i + 1]].tobytes()
+        texts = {"label": row["label"], **json.loads(row["metadata"])}
+        value = {
+            **{
+                f"{n}_time": {"sec": row[f"{n}_ns"] // 10**9, "nanosec": row[f"{n}_ns"] % 10**9}
+                for n in ("start", "end")
+            },
+            "metadata": [{"key": k, "value": v} for k, v in texts.items()],
+        }
+        assert record[:31] == struct.pack("<BQHIQQ", 5, len(record) - 9, 7, i, start, start)
+        assert record[31:] == encode(value, library["foxglove_msgs/Event"], library)
+
+
+def test_annotations_of_several_chunks_read_back(tmp_path):
+    numbers = range(30_000)
+    rows = pl.DataFrame(
+        {
+            "tier": "gait",
+            "start_ns": [n // 2 for n in numbers],
+            "end_ns": [n + 9 for n in numbers],
+            "label": [f"Schritt {n}" for n in numbers],
+            "metadata": [f'{{"länge":"{n * n}"}}' for n in numbers],
+        }
+    )
+    with mr.create(tmp_path / "a.mcap") as out:
+        out.add_annotations(rows)
+    rec = mr.open(tmp_path / "a.mcap")
+    assert not structure(rec)
+    assert len(rec.contents.chunks) > 2
+    assert rec.annotations.equals(rows)
 
 
 def test_metadata_may_be_a_struct_or_left_out(tmp_path):
