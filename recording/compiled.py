@@ -16,6 +16,9 @@ from .codec import HALF, NARROWED, OCTET, PREFIX, SECOND, TIME, WORD
 
 _SEQUENCE, _LOG, _PUBLISH = (PREFIX.fields[name][1] for name in ("sequence", "log", "publish"))  # type: ignore[index]
 
+#: Records that are laid together, field by field: they stay in the processor's first cache meanwhile.
+TOGETHER = 64
+
 #: Without counting references to the arrays (_nrt): numba would do that, atomically, at every call.
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False}
 
@@ -45,17 +48,18 @@ def _loads(kind):
     return intrinsic(typed)
 
 
-def _copies(typing, data, at, source, size):
-    """Copy ``size`` bytes of ``source`` to byte ``at`` of ``data``."""
+def _copies(typing, data, at, source, begin, size):
+    """Copy ``size`` bytes of ``source``, from byte ``begin`` on, to byte ``at`` of ``data``."""
 
     def generate(context, builder, signature, arguments):
         to, given = (
             context.make_array(signature.args[k])(context, builder, arguments[k]).data for k in (0, 2)
         )
-        cgutils.raw_memcpy(builder, builder.gep(to, [arguments[1]]), given, arguments[3], 1)
+        to, given = builder.gep(to, [arguments[1]]), builder.gep(given, [arguments[3]])
+        cgutils.raw_memcpy(builder, to, given, arguments[4], 1)
         return context.get_dummy_value()
 
-    return types.none(data, at, source, size), generate
+    return types.none(data, at, source, begin, size), generate
 
 
 _put: Any = intrinsic(_stores)
@@ -92,32 +96,43 @@ def lay(data, index, template, sequence, times, fields, ends, size, n):
     n : int
         Rows.
     """
-    first = index[0, 1]
-    for i in range(n):
-        record = first + i * size
-        log, publish = _word(times[0] + 8 * i), _word(times[1] + 8 * i)
-        index[i, 0] = log
-        index[i, 1] = record
-        _copy(data, record, template, size)
-        _put(data, record + _SEQUENCE, np.int32(sequence + i))
-        _put(data, record + _LOG, log)
-        _put(data, record + _PUBLISH, publish)
-        k = 0
-        while k < ends[WORD]:
-            _put(data, record + fields[k, 2], _word(fields[k, 0] + i * fields[k, 1]))
-            k += 1
-        while k < ends[NARROWED]:
-            _put(data, record + fields[k, 2], np.float32(_double(fields[k, 0] + i * fields[k, 1])))
-            k += 1
-        while k < ends[HALF]:
-            _put(data, record + fields[k, 2], _half(fields[k, 0] + i * fields[k, 1]))
-            k += 1
-        while k < ends[TIME]:
-            value = _word(fields[k, 0] + i * fields[k, 1])
-            seconds = value // SECOND
-            _put(data, record + fields[k, 2], np.int32(seconds))
-            _put(data, record + fields[k, 2] + 4, np.int32(value - seconds * SECOND))
-            k += 1
-        while k < ends[OCTET]:
-            _put(data, record + fields[k, 2], _octet(fields[k, 0] + i * fields[k, 1]))
-            k += 1
+    begin, first = 0, index[0, 1]
+    while begin < n:
+        m = min(TOGETHER, n - begin)
+        record = first + begin * size
+        _copy(data, record, template, 0, size)
+        done = 1
+        while done < m:
+            more = min(done, m - done)
+            _copy(data, record + done * size, data, record, more * size)
+            done += more
+        log, publish = times[0] + 8 * begin, times[1] + 8 * begin
+        for i in range(m):
+            at = record + i * size
+            index[begin + i, 0] = _word(log + 8 * i)
+            index[begin + i, 1] = at
+            _put(data, at + _SEQUENCE, np.int32(sequence + begin + i))
+            _put(data, at + _LOG, _word(log + 8 * i))
+            _put(data, at + _PUBLISH, _word(publish + 8 * i))
+        for k in range(len(fields)):
+            stride, at = fields[k, 1], record + fields[k, 2]
+            source = fields[k, 0] + begin * stride
+            if k < ends[WORD]:
+                for i in range(m):
+                    _put(data, at + i * size, _word(source + i * stride))
+            elif k < ends[NARROWED]:
+                for i in range(m):
+                    _put(data, at + i * size, np.float32(_double(source + i * stride)))
+            elif k < ends[HALF]:
+                for i in range(m):
+                    _put(data, at + i * size, _half(source + i * stride))
+            elif k < ends[TIME]:
+                for i in range(m):
+                    value = _word(source + i * stride)
+                    seconds = value // SECOND
+                    _put(data, at + i * size, np.int32(seconds))
+                    _put(data, at + i * size + 4, np.int32(value - seconds * SECOND))
+            else:
+                for i in range(m):
+                    _put(data, at + i * size, _octet(source + i * stride))
+        begin += m
