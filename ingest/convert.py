@@ -14,7 +14,7 @@ import polars as pl
 from .. import recording as mr
 from ..recording.errors import MarchaError, OutputExists, UsageError
 from ..recording.provenance import provenance
-from ..recording.threads import ahead, helpers
+from ..recording.threads import Ahead, helpers
 from . import registry
 from .contract import ChannelSpec, CommonOptions, Import, Report, SourceAttachment
 from .truth import Truth, as_text, read_truth
@@ -114,8 +114,9 @@ def convert(
                 written = _Writer(recording, settings, progress)
                 for spec in imported.channels:
                     written.declare(spec)
-                for topic, table in ahead(imported.blocks(), "parse"):
-                    written.add(topic, table)
+                with contextlib.closing(Ahead(imported.blocks(), "parse")) as blocks:
+                    for topic, table in blocks:
+                        written.add(topic, table)
                 report = imported.report
                 for spec, table in truth.tables if truth else ():
                     written.declare(spec)

@@ -8,6 +8,7 @@ heading is zero at power-up; ``a`` and ``g`` are counts of the 16-bit converter.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import ClassVar
@@ -126,17 +127,22 @@ def _packets(path: Path) -> Iterator[tuple[NDArray[np.void], list[tuple[int, int
 
 
 def _sensors(paths: Sequence[Path]) -> dict[int, int]:
-    """Return device id to sensor number (1 or 2), from the first block of each file."""
-    ids: set[int] = set()
+    """Return device id to sensor number (1 or 2), from the first block of each file.
+
+    The way of counting is the one that most packets follow: a damaged id must not renumber the rest.
+    """
+    counts: Counter[int] = Counter()
     for path in paths:
         packets, _ = next(_packets(path))
-        ids |= {int(i) for i in np.unique(packets["id"])}
-    if not ids:
+        counts.update(packets["id"].tolist())
+    if not counts:
         raise MarchaError(f"{paths[0]}: no 28-byte '$' packet in it; is it the device's binary log?")
-    for known in (FROM_ZERO, NUMBERS, ADDRESSES) if 0 in ids else (NUMBERS, ADDRESSES):
-        if any(i in known for i in ids):
-            return {i: n for i, n in known.items() if i in ids}
-    raise MarchaError(f"{paths[0]}: packets of devices {sorted(ids)}; known ids are 1 2, 0 1 or 0x68 0x69")
+    known = max((NUMBERS, ADDRESSES, FROM_ZERO), key=lambda k: sum(counts[i] for i in k))
+    if not counts.keys() & known.keys():
+        raise MarchaError(
+            f"{paths[0]}: packets of devices {sorted(counts)}; known ids are 1 2, 0 1 or 0x68 0x69"
+        )
+    return {i: n for i, n in known.items() if i in counts}
 
 
 def _blocks(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -48,17 +48,44 @@ class _Here(Executor):
         return future
 
 
-def ahead(items: Iterator[T], name: str, depth: int = 1) -> Generator[T, None, None]:
-    """Yield the items, the next ``depth`` of them being made in a thread meanwhile; closes ``items``."""
-    end: Any = object()
-    pool = helpers(name, 1)
-    try:
-        coming = deque(pool.submit(next, items, end) for _ in range(depth))
-        while (item := coming.popleft().result()) is not end:
-            coming.append(pool.submit(next, items, end))
-            yield item
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-        close = getattr(items, "close", None)
+class Ahead(Iterator[T]):
+    """Items that a thread makes before they are asked for; from now on, not from the first on.
+
+    Parameters
+    ----------
+    items : iterator
+        Closed at the end, or by :meth:`close`.
+    name : str
+        Names the thread.
+    depth : int
+        Items that may wait.
+    """
+
+    def __init__(self, items: Iterator[T], name: str, depth: int = 1) -> None:
+        self._items = items
+        self._pool = helpers(name, 1)
+        self._coming = deque(self._pool.submit(next, items, _END) for _ in range(depth))
+
+    def __next__(self) -> T:
+        if self._coming:
+            try:
+                item = self._coming.popleft().result()
+            except BaseException:
+                self.close()
+                raise
+            if item is not _END:
+                self._coming.append(self._pool.submit(next, self._items, _END))
+                return item
+        self.close()
+        raise StopIteration
+
+    def close(self) -> None:
+        """Wait for the item being made, and make no more."""
+        self._coming.clear()
+        self._pool.shutdown(wait=True, cancel_futures=True)
+        close = getattr(self._items, "close", None)
         if close is not None:
             close()
+
+
+_END: Any = object()

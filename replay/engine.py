@@ -14,7 +14,7 @@ import polars as pl
 
 from ..recording.errors import Finding, UsageError
 from ..recording.provenance import environment
-from ..recording.threads import ahead
+from ..recording.threads import Ahead
 from .blocks import Block
 from .clock import Clock, SystemClock
 from .feed import Feed, GapPolicy, Merged
@@ -201,10 +201,13 @@ class Engine:
         self._batches: Iterator[Batch] | None = None
         self._exhausted = False
         self._checkpoints = [self._checkpoint(self._position_ns)]
+        if self.source.seekable:
+            self._batches = self._reading()  # while the sinks copy what they are given
         try:
             for sink in self.sinks:
                 sink.open(self.plan)
         except BaseException:
+            self._stop_reading()
             self._close_sinks(None)
             raise
 
@@ -360,15 +363,17 @@ class Engine:
             if self._exhausted:
                 return None
             if self._batches is None:
-                batches = self.source.batches(self._topics, self._position_start(), self._end_ns)
-                # A live source has a queue of its own.
-                self._batches = ahead(batches, "replay", 2) if self.source.seekable else batches
+                self._batches = self._reading()
             batch = next(self._batches, None)
             if batch is None:
                 self._exhausted = True
                 return None
             self._merged, self._cursor = Merged(batch), 0
         return self._merged
+
+    def _reading(self) -> Iterator[Batch]:
+        batches = self.source.batches(self._topics, self._position_start(), self._end_ns)
+        return Ahead(batches, "replay", 2) if self.source.seekable else batches  # live: has its own queue
 
     def _position_start(self) -> int | None:
         return self._position_ns if self._position_ns != self._begin_ns else self._start_ns

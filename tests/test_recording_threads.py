@@ -10,7 +10,7 @@ import marcha.recording as mr
 import numpy as np
 import polars as pl
 import pytest
-from marcha.recording.threads import LIMIT, ahead, helpers, threads
+from marcha.recording.threads import LIMIT, Ahead, helpers, threads
 
 
 @pytest.mark.parametrize(("given", "most"), [("1", 1), ("2", 2), ("", 4), ("none", 4), ("0", 4), ("-3", 4)])
@@ -50,11 +50,27 @@ def test_reading_ahead_keeps_order_and_closes(
         finally:
             closed.append(True)
 
-    assert list(ahead(numbers(), "test", depth)) == list(range(10))
-    early = ahead(numbers(), "test", depth)
+    assert list(Ahead(numbers(), "test", depth)) == list(range(10))
+    early = Ahead(numbers(), "test", depth)
     assert next(early) == 0
     early.close()
     assert closed == [True, True]
+
+
+@pytest.mark.parametrize("limit", ["1", "4"])
+def test_reading_ahead_closes_what_nobody_asked_for(monkeypatch: pytest.MonkeyPatch, limit: str) -> None:
+    monkeypatch.setenv(LIMIT, limit)
+    before, closed = threading.active_count(), []
+
+    def numbers() -> Iterator[int]:
+        try:
+            yield from range(10)
+        finally:
+            closed.append(True)
+
+    Ahead(numbers(), "test").close()
+    assert closed == [True]
+    assert threading.active_count() == before
 
 
 @pytest.mark.parametrize("limit", ["1", "4"])
@@ -67,7 +83,7 @@ def test_reading_ahead_raises_where_the_item_would_have_been(
         yield 1
         raise ValueError("no second number")
 
-    items = ahead(numbers(), "test")
+    items = Ahead(numbers(), "test")
     assert next(items) == 1
     with pytest.raises(ValueError, match="no second number"):
         next(items)
