@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections import deque
-from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from pathlib import Path
 
@@ -14,15 +12,6 @@ from .threads import helpers
 
 SYNC_BYTES = 1 << 26
 """So many bytes go to disk together, while more are being written."""
-
-TOGETHER_BYTES = 1 << 22
-"""So many bytes are handed to the writing thread together: waking it costs as much as writing 100 kB."""
-
-_QUEUE = 4
-"""Hand-overs that may wait for the disk: bounds memory."""
-
-Written = Callable[[], object]
-Pieces = tuple[bytes | memoryview, ...]
 
 
 class AtomicFile:
@@ -47,10 +36,6 @@ class AtomicFile:
         self.path = path
         self.overwrite = overwrite
         self._done = False
-        self._collected: list[tuple[Pieces, Written | None]] = []
-        self._collected_bytes = 0
-        self._writer: Executor = helpers("file", 1)
-        self._writing: deque[Future[None]] = deque()
         self._syncer: Executor = helpers("sync", 1)
         self._syncing: Future[None] | None = None
         self._unsynced = 0
@@ -72,54 +57,33 @@ class AtomicFile:
                 raise _failure(path, e) from None
         _lock(self._file.fileno())
 
-    def write(self, *pieces: bytes | memoryview, written: Written | None = None) -> None:
-        """Append bytes, in the background; what has come together goes to disk meanwhile.
+    def write(self, *pieces: bytes | memoryview) -> None:
+        """Append bytes; what has come together goes to disk in the background.
 
         Parameters
         ----------
         *pieces : bytes or memoryview
-            One behind the other. They must stay as they are until they are written.
-        written : callable, optional
-            Called when they are, from another thread.
+            One behind the other.
 
         Raises
         ------
         MarchaError
             The disk is full or failed, now or with an earlier call; nothing is left.
         """
-        self._collected.append((pieces, written))
-        self._collected_bytes += sum(map(len, pieces))
-        if self._collected_bytes >= TOGETHER_BYTES:
-            try:
-                self._hand_over()
-            except OSError as e:
-                self.abort()
-                raise _failure(self.path, e) from None
-
-    def _hand_over(self) -> None:
-        while len(self._writing) >= _QUEUE:
-            self._writing.popleft().result()
-        self._writing.append(self._writer.submit(self._write, self._collected))
-        self._collected, self._collected_bytes = [], 0
-
-    def _write(self, collected: list[tuple[Pieces, Written | None]]) -> None:
-        for pieces, written in collected:
+        try:
             for piece in pieces:
                 self._file.write(piece)
                 self._unsynced += len(piece)
-            if written is not None:
-                written()
-        if self._unsynced >= SYNC_BYTES and (self._syncing is None or self._syncing.done()):
-            if self._syncing is not None:
-                self._syncing.result()
-            self._unsynced = 0
-            self._syncing = self._syncer.submit(os.fsync, self._file.fileno())
+            if self._unsynced >= SYNC_BYTES and (self._syncing is None or self._syncing.done()):
+                self._settle()
+                self._unsynced = 0
+                self._syncing = self._syncer.submit(os.fsync, self._file.fileno())
+        except OSError as e:
+            self.abort()
+            raise _failure(self.path, e) from None
 
     def _settle(self) -> None:
-        """Wait for what is done in the background; raise what went wrong there."""
-        self._hand_over()
-        while self._writing:
-            self._writing.popleft().result()
+        """Wait for what goes to disk in the background; raise what went wrong there."""
         if self._syncing is not None:
             self._syncing.result()
 
@@ -161,7 +125,6 @@ class AtomicFile:
         self.part.unlink(missing_ok=True)
 
     def _close(self) -> None:
-        self._writer.shutdown(cancel_futures=True)
         self._syncer.shutdown()
         self._file.close()
 

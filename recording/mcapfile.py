@@ -170,7 +170,9 @@ class McapFile:
         self._count(body, crc=packed.crc)
         index_at = self._at
         self._count(*packed.indexes)
-        self._file.write(*packed.chunk, *packed.indexes, written=packed.written)
+        self._file.write(*packed.chunk, *packed.indexes)
+        if packed.written is not None:
+            packed.written()
         self._chunks.append(
             ChunkIndex(
                 chunk_length=index_at - start,

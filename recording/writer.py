@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+from collections import deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -21,8 +23,12 @@ from .definitions import full_text
 from .errors import MarchaError, UsageError
 from .mcapfile import CHUNK_SIZE, ZSTD_LEVEL, McapFile, Packed, pack
 from .schemas import find_schema
+from .threads import helpers
 
 Times = NDArray[np.int64]
+
+_QUEUE = 8
+"""Tables that may wait to be written: bounds memory."""
 
 if TYPE_CHECKING:
     from .reader import Recording
@@ -72,6 +78,8 @@ class Writer:
         self.path = Path(path)
         self._level = level
         self._file = McapFile(self.path, overwrite=overwrite, threads=level is not None)
+        self._worker: Executor = helpers("record", 1)
+        self._jobs: deque[Future[None]] = deque()
         self._outputs: dict[str, _Output] = {}
         self._annotations: list[pl.DataFrame] = []
         self._closed = False
@@ -196,7 +204,9 @@ class Writer:
         except MarchaError as e:
             raise MarchaError(f"{self.path}: {e}") from None
         out.last_log = int(log[-1])
-        self._put(out, out.encoder, arrays, t_ns, log)
+        while len(self._jobs) >= _QUEUE:
+            self._jobs.popleft().result()
+        self._jobs.append(self._worker.submit(self._put, out, out.encoder, arrays, t_ns, log))
 
     def add_annotations(self, table: pl.DataFrame) -> None:
         """Add labelled intervals; may be called again.
@@ -226,7 +236,7 @@ class Writer:
             The name is taken: readers show one record a name.
         """
         self._check_open()
-        self._file.add_metadata(name, values)
+        self._caught_up().add_metadata(name, values)
 
     def add_attachment(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
         """Attach a file (anchor table, floor plan, raw source …).
@@ -237,7 +247,7 @@ class Writer:
             The name is taken.
         """
         self._check_open()
-        self._file.add_attachment(name, data, media_type)
+        self._caught_up().add_attachment(name, data, media_type)
 
     def copy_from(self, rec: Recording, topics: Collection[str] | None = None) -> None:
         """Copy channels of another recording, with its metadata records, attachments and annotations.
@@ -263,7 +273,7 @@ class Writer:
         from .copying import copy_into
 
         self._check_open()
-        copy_into(self._file, rec, topics, self._level)
+        copy_into(self._caught_up(), rec, topics, self._level)
         annotations = rec.annotations
         if topics is not None:
             annotations = annotations.filter((TOPIC + pl.col("tier")).is_in(list(topics)))
@@ -279,30 +289,40 @@ class Writer:
         if self._closed:
             return
         try:
+            file = self._caught_up()
             for out in self._outputs.values():
                 if out.encoder is None:
                     raise UsageError(f"{self.path}: {out.topic}: declared without columns and never written")
                 self._flush(out)
             if self._annotations:
                 self._put_annotations(pl.concat(self._annotations))
-            self._file.finish()
+            file.finish()
         except BaseException:
             self.abort()
             raise
         self._closed = True
+        self._worker.shutdown()
 
     def abort(self) -> None:
         """Drop the recording; nothing is left on disk."""
         if not self._closed:
             self._closed = True
+            self._worker.shutdown(cancel_futures=True)
             self._file.abort()
+
+    def _caught_up(self) -> McapFile:
+        """Return the file with all rows in it so far; raise what went wrong with them."""
+        while self._jobs:
+            self._jobs.popleft().result()
+        return self._file
 
     def _check_open(self) -> None:
         if self._closed:
             raise UsageError(f"{self.path}: the recording is closed")
 
     def _declare(self, out: _Output, columns: tuple[str, ...]) -> None:
-        out.id = self._file.free_id()
+        file = self._caught_up()
+        out.id = file.free_id()
         try:
             out.encoder = Encoder(find_schema(out.schema), columns, out.frame_id, out.topic, out.id)
         except MarchaError as e:
@@ -314,8 +334,8 @@ class Writer:
             "frame_id": out.frame_id,
             **out.metadata,
         }
-        schema = self._file.add_schema(out.schema, "ros2msg", full_text(out.schema).encode())
-        self._file.add_channel(Channel(out.id, out.topic, "cdr", metadata, schema))
+        schema = file.add_schema(out.schema, "ros2msg", full_text(out.schema).encode())
+        file.add_channel(Channel(out.id, out.topic, "cdr", metadata, schema))
 
     def _times(
         self, given: Mapping[str, pl.Series | NDArray[Any]], name: str, where: str

@@ -183,7 +183,6 @@ def test_a_large_file_goes_to_disk_while_it_is_written(
 ) -> None:
     synced: list[int] = []
     monkeypatch.setenv("MARCHA_THREADS", "1")  # each write is through before the next
-    monkeypatch.setattr("marcha.recording.atomic.TOGETHER_BYTES", 100)
     monkeypatch.setattr("marcha.recording.atomic.SYNC_BYTES", 100)
     monkeypatch.setattr("os.fsync", synced.append)
     file = AtomicFile(tmp_path / "a")
@@ -200,7 +199,6 @@ def test_a_disk_that_fails_in_the_background_leaves_nothing(
     def broken(_: int) -> None:
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr("marcha.recording.atomic.TOGETHER_BYTES", 100)
     monkeypatch.setattr("marcha.recording.atomic.SYNC_BYTES", 100)
     monkeypatch.setattr("os.fsync", broken)
     file = AtomicFile(tmp_path / "a")
