@@ -22,7 +22,12 @@ IMU = "sensor_msgs/msg/Imu"
 COLUMNS = ("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z")
 SAMPLES = 1_000_000
 PLAIN_SAMPLES = 20_000
-PER_SAMPLE, IN_BLOCKS, MEMORY_MB = 150_000, 1_500_000, 400
+PER_SAMPLE, MEMORY_MB = 150_000, 400
+IN_BLOCKS, VQF_WHERE_PROMISED = 1_500_000, 1e6 / 0.23
+"""Samples a second in blocks, promised for a machine on which vqf takes 0.23 µs a sample: what is compared is
+their ratio, 0.345, since machines differ by more than two."""
+PAIRS = 5
+"""Blocks and vqf are measured in turn; the pair with the median ratio counts."""
 
 
 def rows(scale: float) -> list[Row]:
@@ -36,19 +41,28 @@ def rows(scale: float) -> list[Row]:
         run(end_ns=10**9, mode="sample")
         kept = n / _best(lambda: run())
         out = Path(folder, "out.mcap")
-        blocks = n / _best(lambda: _written(run, out))
+        gone: Callable[[], object] = lambda: out.unlink(missing_ok=True)  # noqa: E731
+        pairs = [
+            (n / _best(lambda: _written(run, out), gone), n / _best(lambda: _vqf(readings)))
+            for _ in range(PAIRS)
+        ]
+        blocks, vqf = sorted(pairs, key=lambda p: p[0] / p[1])[PAIRS // 2]
         single = n / _best(lambda: run(mode="sample"))
-        written = n / _best(lambda: _written(run, out, mode="sample"))
+        written = n / _best(lambda: _written(run, out, mode="sample"), gone)
         plain = PLAIN_SAMPLES / _best(lambda: _plain_filter(readings[:PLAIN_SAMPLES]))
-        vqf = n / _best(lambda: _vqf(readings))
         _recording(large, 4 * n)
         growth = _peak_mb(large) - _peak_mb(small)
-    numpy_loop = "9-state filter in plain NumPy, no files"
+    numpy_loop, library = "9-state filter in plain NumPy, no files", "vqf (C++), orientation only, no files"
+    ratio = IN_BLOCKS / VQF_WHERE_PROMISED
     return [
         _rate("replay per sample, results in memory", single, numpy_loop, plain, PER_SAMPLE),
         _rate("replay per sample, all six outputs recorded", written, numpy_loop, plain, PER_SAMPLE),
-        _rate("replay in blocks, results in memory", kept, "vqf (C++), orientation only", vqf, IN_BLOCKS),
-        _rate("replay in blocks, all six outputs recorded", blocks, numpy_loop, plain, IN_BLOCKS),
+        Row("replay in blocks, results in memory, with metrics", kept, "samples/s", library, vqf, kept / vqf,
+            f"≥ {ratio:.3f} × vqf", kept >= ratio * vqf),
+        Row("replay in blocks, all six outputs recorded", blocks, "samples/s", library, vqf, blocks / vqf,
+            f"≥ {ratio:.3f} × vqf", blocks >= ratio * vqf),
+        Row("the same, against the plain filter", blocks, "samples/s", numpy_loop, plain, blocks / plain,
+            "", True),
         Row(
             f"memory of a recorded replay, {4 * n:,} samples above {n:,}", growth, "MB", "", None, None,
             f"< {MEMORY_MB} MB", growth < MEMORY_MB,
@@ -72,14 +86,15 @@ def _recording(path: Path, n: int) -> np.ndarray:
 
 def _written(run: Callable[..., Any], path: Path, **options: Any) -> None:
     """Replay into a new recording, and nothing else: no tables in memory, no metrics."""
-    path.unlink(missing_ok=True)
     run(out=path, keep_tables=False, metrics=False, **options)
 
 
-def _best(task: Callable[[], Any], times: int = 3) -> float:
-    """Return the shortest of a few runs in seconds."""
+def _best(task: Callable[[], Any], before: Callable[[], object] | None = None, times: int = 3) -> float:
+    """Return the shortest of a few runs in seconds; ``before`` each, something that does not count."""
     best = float("inf")
     for _ in range(times):
+        if before is not None:
+            before()
         begin = time.perf_counter()
         task()
         best = min(best, time.perf_counter() - begin)

@@ -48,8 +48,11 @@ def check_annotations(table: pl.DataFrame) -> pl.DataFrame:
     if set(table.columns) != set(COLUMNS):
         odd = ", ".join(sorted(set(table.columns) ^ set(COLUMNS)))
         raise MarchaError(f"annotations: columns missing or unknown: {odd}; they are {', '.join(COLUMNS)}")
-    values = [_metadata(v) for v in table["metadata"].to_list()]
-    table = table.with_columns(pl.Series("metadata", values, dtype=pl.String)).select(*COLUMNS)
+    given = table["metadata"].to_list()
+    if not _canonical(given):
+        values = [_metadata(v) for v in given]
+        table = table.with_columns(pl.Series("metadata", values, dtype=pl.String))
+    table = table.select(*COLUMNS)
     for name, kind in COLUMNS.items():
         if table.height and table.schema[name] != kind:
             raise MarchaError(f"annotations: column {name!r}: type {table.schema[name]}, must be {kind}")
@@ -68,6 +71,17 @@ def check_annotations(table: pl.DataFrame) -> pl.DataFrame:
         if not tier or tier.startswith("/") or tier != tier.strip():
             raise MarchaError(f"annotations: tier {tier!r} must be a plain name; its topic is {TOPIC}<tier>")
     return table.sort("tier", "start_ns", maintain_order=True)
+
+
+def _canonical(values: list[Any]) -> bool:
+    """Return whether all values are texts as :func:`_metadata` returns them; parsed all at once."""
+    try:
+        decoded = _ALL_TEXTS.decode(f"[{','.join(values)}]")
+    except (TypeError, msgspec.DecodeError):
+        return False
+    return not any("label" in texts for texts in decoded) and values == [
+        _CANONICAL.encode(texts).decode() for texts in decoded
+    ]
 
 
 def _metadata(value: Any) -> str:

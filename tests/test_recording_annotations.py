@@ -179,6 +179,7 @@ def test_any_annotations_round_trip(tmp_path_factory, values):
         ({"start_ns": pl.lit(1.5)}, "'start_ns': type Float64"),
         ({"metadata": pl.lit("[1]")}, "not an object"),
         ({"metadata": pl.lit("{")}, "not the text of a JSON object"),
+        ({"metadata": pl.Series(['{},{"a":"}', '{"}', "{}"])}, "not the text of a JSON object"),
         ({"metadata": pl.lit('{"label": "x"}')}, "may not have the key 'label'"),
         ({"extra": pl.lit(1)}, "missing or unknown: extra"),
         ({"label": pl.lit("a\0b")}, "NUL"),
