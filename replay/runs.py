@@ -215,12 +215,11 @@ class Runner:
     def _note_stances(self, t_ns: IntArray, still: NDArray[np.bool_]) -> None:
         """Join still samples to intervals: first to last still sample."""
         state = self._state
-        before = state.still_since is not None
-        edges = np.flatnonzero(np.diff(still, prepend=before))
+        edges = np.flatnonzero(np.diff(still, prepend=state.still_since is not None))
         begins, after = edges[still[edges]], edges[~still[edges]]
         since, until = t_ns[begins], t_ns[after - 1]
-        if before:
-            since = np.concatenate(([state.still_since], since))
+        if state.still_since is not None:
+            since = np.append(np.int64(state.still_since), since)
         if len(after) and after[0] == 0:
             until[0] = state.still_until
         self._stances.append(np.column_stack((since[: len(until)], until)))
