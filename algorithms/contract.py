@@ -192,7 +192,10 @@ class KernelEstimator(PlainEstimator):
         return out if self.kernel(self.state, row, out) else None
 
     def run_block(self, rows: FloatArray, out: FloatArray) -> int:
-        """Take ``rows`` (n, inputs), fill ``out`` (n, outputs); rows without a result are NaN."""
+        """Take ``rows`` (n, inputs), fill ``out`` (n, outputs); rows without a result are NaN.
+
+        Both may lie by columns in memory, as the engine's do: a single row is then no contiguous array.
+        """
         return int(self.run(self.state, rows, out))
 
     def flush(self) -> FloatArray:

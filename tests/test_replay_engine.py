@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -120,6 +121,38 @@ def test_a_sink_that_cannot_rewind_sees_every_message_once(back: int, forth: int
     engine.play()
     engine.finish()
     assert same_bits(sink.joined(), straight.joined())
+
+
+class StandsWhilePositive(PlainEstimator):
+    """Still where the first value is positive."""
+
+    name = "stands"
+    inputs = (Input(IMU, ("acc_x",)),)
+    outputs = (Output("stance", "marcha_msgs/msg/Stance", ("still",)),)
+
+    def step(self, row: np.ndarray) -> np.ndarray:
+        return (row[1:] > 0).astype(float)
+
+
+@given(
+    still=st.lists(st.booleans(), min_size=1, max_size=40),
+    max_rows=st.integers(1, 45),
+    back=st.integers(0, 40),
+)
+def test_stances_are_the_runs_of_still_samples_however_they_come(
+    still: list[bool], max_rows: int, back: int
+) -> None:
+    t_ns = [START + i * STEP_NS for i in range(len(still))]
+    rows = table(t_ns, {"acc_x": [1.0 if s else -1.0 for s in still]})
+    source = MemorySource([(channel("/foot/imu", IMU, ("acc_x",)), rows)], max_rows)
+    engine, _ = engine_of(source, [StandsWhilePositive()], checkpoint_s=0.05)
+    engine.play()
+    engine.seek(START + back * STEP_NS)
+    engine.play()
+    (run,) = engine.finish().runs
+    runs = [list(g) for s, g in groupby(zip(still, t_ns, strict=True), lambda p: p[0]) if s]
+    expected = [(g[0][1], g[-1][1]) for g in runs]
+    assert run.annotations.select("start_ns", "end_ns").rows() == expected
 
 
 def test_seek_back_goes_to_the_nearest_checkpoint() -> None:
