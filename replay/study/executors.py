@@ -260,11 +260,14 @@ def _server_pid() -> int | None:
 
 def _stop_server() -> None:
     """End the server that processes are forked from, if there is one; the next pool starts another."""
-    pid = _server_pid()
-    if pid is not None:
-        with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
-        _server()._stop()  # waits for it: it must not be taken for a living one
+    if _server_pid() is None:
+        return
+    server = _server()
+    with server._lock:  # or another thread could start one that is waited for and was never killed
+        if server._forkserver_pid is not None:
+            with suppress(ProcessLookupError):
+                os.kill(server._forkserver_pid, signal.SIGKILL)
+            server._stop_unlocked()  # waits for it: it must not be taken for a living one
 
 
 def _one_by_one(function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outcome[T, R]]:
