@@ -54,7 +54,7 @@ def rows(scale: float) -> list[Row]:
 
 def _measure(workers: int, walks: int, folder: Path) -> tuple[float, float]:
     """Return wall and CPU seconds of a whole study; a process means a core: libraries get one thread."""
-    from marcha.replay.study.executors import SINGLE_THREAD
+    from marcha.study.executors import SINGLE_THREAD
 
     arguments = [str(workers), str(walks), str(folder)]
     command = [sys.executable, "-W", "ignore", "-m", "benchmarks.study", *arguments]
@@ -81,7 +81,7 @@ def _run(workers: int, walks: int, folder: Path) -> None:
     import msgspec
     from marcha.ingest import convert
     from marcha.ingest.simulate import simulate
-    from marcha.replay.study import load, run_study
+    from marcha.study import load, run_study
 
     config, _ = load("foot-simulated")
     assert config.simulate is not None

@@ -7,9 +7,24 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import App, Parameter
 
-from .console import Heading, Outcome, Table, complain
+from .console import (
+    Heading,
+    Outcome,
+    Table,
+    complain,
+)
 from .contents import say_losses
-from .options import DEFAULT, QUIET, Common, Force, MaybeOutput, Shown, Strings, instant, settings
+from .options import (
+    DEFAULT,
+    QUIET,
+    Common,
+    Force,
+    MaybeOutput,
+    Shown,
+    Strings,
+    instant,
+    settings,
+)
 
 if TYPE_CHECKING:
     import polars as pl

@@ -13,8 +13,20 @@ from typing import Any
 
 from cyclopts import App, CycloptsError, Group
 
-from .console import Outcome, complain, emit, emit_json, warn
-from .errors import DONE, FAILED, INTERRUPTED, USAGE, expected
+from .console import (
+    Outcome,
+    complain,
+    emit,
+    emit_json,
+    warn,
+)
+from .errors import (
+    DONE,
+    FAILED,
+    INTERRUPTED,
+    USAGE,
+    expected,
+)
 from .options import QUIET
 
 EPILOGUE = (

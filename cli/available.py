@@ -13,7 +13,7 @@ def formats(*, common: Common = DEFAULT) -> Outcome:
     import msgspec
 
     from .. import export
-    from ..ingest.registry import formats as readable
+    from ..ingest.registry import known_formats as readable
 
     readers = msgspec.to_builtins(readable())
     writers = [

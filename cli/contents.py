@@ -5,7 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .console import Heading, Outcome, Table, complain
+from .console import (
+    Heading,
+    Outcome,
+    Table,
+    complain,
+)
 from .errors import DEFECTS, DONE
 from .options import DEFAULT, Common
 

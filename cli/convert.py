@@ -7,10 +7,27 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from .console import Heading, Outcome, Table, complain, progress
+from .console import (
+    Heading,
+    Outcome,
+    Table,
+    complain,
+    progress,
+)
 from .contents import channel_table, finding_entry, finding_table
-from .errors import DEFECTS, DONE, FAILED, expected
-from .options import DEFAULT, Common, Force, Strings, settings
+from .errors import (
+    DEFECTS,
+    DONE,
+    FAILED,
+    expected,
+)
+from .options import (
+    DEFAULT,
+    Common,
+    Force,
+    Strings,
+    settings,
+)
 
 
 def convert(

@@ -8,9 +8,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from .console import Heading, Outcome, Table, columns_of, number
+from .console import (
+    Heading,
+    Outcome,
+    Table,
+    columns_of,
+    number,
+)
 from .contents import finding_entry
-from .options import DEFAULT, Common, Force, Shown
+from .options import (
+    DEFAULT,
+    Common,
+    Force,
+    Shown,
+)
 
 if TYPE_CHECKING:
     from ..recording import Recording

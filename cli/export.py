@@ -9,7 +9,15 @@ from cyclopts import Parameter
 
 from .console import Heading, Outcome
 from .contents import say_losses
-from .options import DEFAULT, Common, Force, Output, Strings, instant, settings
+from .options import (
+    DEFAULT,
+    Common,
+    Force,
+    Output,
+    Strings,
+    instant,
+    settings,
+)
 
 
 def export(

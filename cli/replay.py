@@ -7,10 +7,26 @@ from typing import Annotated, Any, Literal
 
 from cyclopts import Parameter
 
-from .console import Heading, Outcome, Table, columns_of, progress
+from .console import (
+    Heading,
+    Outcome,
+    Table,
+    columns_of,
+    progress,
+)
 from .contents import finding_entry, say_losses
 from .errors import DEFECTS, DONE, THRESHOLD
-from .options import DEFAULT, Common, Force, MaybeOutput, Shown, Strings, instant, limits, settings
+from .options import (
+    DEFAULT,
+    Common,
+    Force,
+    MaybeOutput,
+    Shown,
+    Strings,
+    instant,
+    limits,
+    settings,
+)
 
 
 def replay(

@@ -7,7 +7,15 @@ from typing import Annotated, Literal
 from cyclopts import Parameter
 
 from .console import Heading, Outcome
-from .options import DEFAULT, Common, Force, Output, Shown, Strings, settings
+from .options import (
+    DEFAULT,
+    Common,
+    Force,
+    Output,
+    Shown,
+    Strings,
+    settings,
+)
 
 
 def simulate(

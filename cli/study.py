@@ -8,7 +8,13 @@ from cyclopts import Parameter
 
 from .console import Heading, Outcome, progress
 from .errors import DEFECTS, DONE
-from .options import DEFAULT, Common, Force, Output, Paths
+from .options import (
+    DEFAULT,
+    Common,
+    Force,
+    Output,
+    Paths,
+)
 
 
 def study(
@@ -48,7 +54,7 @@ def study(
     """
     from ..ingest import convert
     from ..ingest.simulate import simulate
-    from ..replay.study import run_study
+    from ..study import run_study
 
     with progress("study", common) as report:
         done = run_study(

@@ -6,8 +6,20 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from .console import Heading, Outcome, Table, progress
-from .options import DEFAULT, Common, Paths, Shown, Strings, settings
+from .console import (
+    Heading,
+    Outcome,
+    Table,
+    progress,
+)
+from .options import (
+    DEFAULT,
+    Common,
+    Paths,
+    Shown,
+    Strings,
+    settings,
+)
 
 
 def tune(

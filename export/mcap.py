@@ -11,7 +11,12 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from ..recording import SCHEMAS, Recording, Writer, create
+from ..recording import (
+    SCHEMAS,
+    Recording,
+    Writer,
+    create,
+)
 from ..recording.errors import MarchaError
 from ..recording.selection import Selection, selected_topics, within
 from .events import ANNOTATIONS

@@ -1,8 +1,23 @@
 """Raw logs to recordings: one module a format; each recognises its content and reports every defect."""
 
-from .contract import ChannelSpec, CommonOptions, Import, Importer, Report, ReportBuilder, SourceAttachment
+from .contract import (
+    ChannelSpec,
+    CommonOptions,
+    Import,
+    Importer,
+    Report,
+    ReportBuilder,
+    SourceAttachment,
+)
 from .convert import Converted, ConvertedChannel, convert
-from .registry import Candidate, FormatInfo, OptionInfo, formats, importers, recognise
+from .registry import (
+    Candidate,
+    FormatInfo,
+    OptionInfo,
+    importers,
+    known_formats,
+    recognise,
+)
 
 __all__ = [
     "Candidate",
@@ -18,7 +33,7 @@ __all__ = [
     "ReportBuilder",
     "SourceAttachment",
     "convert",
-    "formats",
     "importers",
+    "known_formats",
     "recognise",
 ]

@@ -16,7 +16,13 @@ from ..recording.errors import MarchaError, OutputExists, UsageError
 from ..recording.provenance import provenance
 from ..recording.threads import Ahead, helpers
 from . import registry
-from .contract import ChannelSpec, CommonOptions, Import, Report, SourceAttachment
+from .contract import (
+    ChannelSpec,
+    CommonOptions,
+    Import,
+    Report,
+    SourceAttachment,
+)
 from .truth import Truth, as_text, read_truth
 
 T = TypeVar("T")

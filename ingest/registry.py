@@ -120,7 +120,7 @@ def get(name: str) -> Registered:
     return known[name]
 
 
-def formats() -> list[FormatInfo]:
+def known_formats() -> list[FormatInfo]:
     """Return every format with its options and their documentation."""
     return [_info(r) for r in importers().values()]
 

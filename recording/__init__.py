@@ -11,9 +11,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .errors import Finding, MarchaError, OutputExists, UsageError
+from .errors import (
+    Finding,
+    MarchaError,
+    OutputExists,
+    UsageError,
+)
 from .mcapfile import ZSTD_LEVEL
-from .reader import Attachment, Channel, Message, Recording, Window
+from .reader import (
+    Attachment,
+    Channel,
+    Message,
+    Recording,
+    Window,
+)
 from .schemas import SCHEMAS, Column, Schema
 from .writer import Writer
 

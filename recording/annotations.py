@@ -12,7 +12,13 @@ import polars as pl
 from numpy.typing import NDArray
 
 from .cdr import Bytes, decode
-from .codec import MAX_TIME_NS, PREFIX, SECOND, Columns, Messages
+from .codec import (
+    MAX_TIME_NS,
+    PREFIX,
+    SECOND,
+    Columns,
+    Messages,
+)
 from .definitions import Library
 from .errors import MarchaError
 

@@ -9,7 +9,15 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from .cdr import Bytes, CdrError, Layout, decode_text, layout_of_lengths, layout_of_message, split_index
+from .cdr import (
+    Bytes,
+    CdrError,
+    Layout,
+    decode_text,
+    layout_of_lengths,
+    layout_of_message,
+    split_index,
+)
 from .definitions import Library, load
 from .errors import MarchaError, UsageError
 from .schemas import TECHNOLOGIES, Group, Schema

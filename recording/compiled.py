@@ -12,7 +12,14 @@ import numpy as np
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-from .codec import HALF, NARROWED, PREFIX, SECOND, TIME, WORD
+from .codec import (
+    HALF,
+    NARROWED,
+    PREFIX,
+    SECOND,
+    TIME,
+    WORD,
+)
 
 _SEQUENCE, _LOG, _PUBLISH = (PREFIX.fields[name][1] for name in ("sequence", "log", "publish"))  # type: ignore[index]
 

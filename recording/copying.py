@@ -9,10 +9,22 @@ import numpy as np
 from mcap.records import Channel
 
 from .annotations import EventDecoder
-from .chunks import ChunkError, ChunkRef, chunk_head, read_chunk, read_index, split
+from .chunks import (
+    ChunkError,
+    ChunkRef,
+    chunk_head,
+    read_chunk,
+    read_index,
+    split,
+)
 from .codec import PREFIX, Messages, index_of
 from .errors import MarchaError, UsageError
-from .mcapfile import McapFile, Packed, pack, seal
+from .mcapfile import (
+    McapFile,
+    Packed,
+    pack,
+    seal,
+)
 
 if TYPE_CHECKING:
     from .reader import Recording

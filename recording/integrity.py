@@ -8,7 +8,14 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from .checksum import crc32
-from .chunks import ChunkError, ChunkRef, add_finding, read_chunk, read_index, split
+from .chunks import (
+    ChunkError,
+    ChunkRef,
+    add_finding,
+    read_chunk,
+    read_index,
+    split,
+)
 from .errors import Finding
 
 if TYPE_CHECKING:

@@ -19,7 +19,12 @@ import polars as pl
 from mcap import records
 from mcap.data_stream import ReadDataStream
 
-from .annotations import COLUMNS, EVENT, TOPIC, EventDecoder
+from .annotations import (
+    COLUMNS,
+    EVENT,
+    TOPIC,
+    EventDecoder,
+)
 from .cdr import CdrError
 from .chunks import (
     BROKEN,
@@ -32,7 +37,12 @@ from .chunks import (
     read_index,
     split,
 )
-from .codec import Columns, Decoder, Encoder, Messages
+from .codec import (
+    Columns,
+    Decoder,
+    Encoder,
+    Messages,
+)
 from .definitions import load, long_name, parse_full
 from .errors import Finding, MarchaError, UsageError
 from .schemas import SCHEMAS, Schema

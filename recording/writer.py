@@ -17,11 +17,27 @@ import polars as pl
 from mcap.records import Channel
 from numpy.typing import NDArray
 
-from .annotations import EVENT, TOPIC, check_annotations, encode_events
-from .codec import Chunk, Encoder, check_times, index_of
+from .annotations import (
+    EVENT,
+    TOPIC,
+    check_annotations,
+    encode_events,
+)
+from .codec import (
+    Chunk,
+    Encoder,
+    check_times,
+    index_of,
+)
 from .definitions import full_text
 from .errors import MarchaError, UsageError
-from .mcapfile import CHUNK_SIZE, ZSTD_LEVEL, McapFile, Packed, pack
+from .mcapfile import (
+    CHUNK_SIZE,
+    ZSTD_LEVEL,
+    McapFile,
+    Packed,
+    pack,
+)
 from .schemas import find_schema
 from .threads import helpers
 

@@ -4,12 +4,30 @@ from .alignment import ALIGNMENTS, align
 from .api import replay
 from .clock import Clock, ManualClock, SystemClock
 from .engine import Engine, ReplayResult, Run
-from .evaluate import Evaluation, RunEvaluation, check_thresholds, evaluate
+from .evaluate import (
+    Evaluation,
+    RunEvaluation,
+    check_thresholds,
+    evaluate,
+)
 from .feed import GapPolicy
 from .metrics import RunView, Truth, nees_bounds
-from .plan import EstimatorSpec, Plan, PlannedRun, parse_estimator, plan_runs
+from .plan import (
+    EstimatorSpec,
+    Plan,
+    PlannedRun,
+    parse_estimator,
+    plan_runs,
+)
 from .sinks import RecordingSink, Sink, TableSink
-from .sources import Batch, LiveSource, PlannedChannel, RecordingSource, Source, SourceFailed
+from .sources import (
+    Batch,
+    LiveSource,
+    PlannedChannel,
+    RecordingSource,
+    Source,
+    SourceFailed,
+)
 from .tuning import Tuned, tune
 
 __all__ = [

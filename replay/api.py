@@ -13,7 +13,12 @@ from ..recording import open as open_recording
 from ..recording.errors import OutputExists, UsageError
 from ..recording.provenance import hash_file
 from .clock import Clock
-from .engine import Engine, Progress, ReplayResult, Run
+from .engine import (
+    Engine,
+    Progress,
+    ReplayResult,
+    Run,
+)
 from .evaluate import evaluate, evaluate_run, recording_view
 from .feed import GapPolicy
 from .plan import EstimatorLike, plan_runs

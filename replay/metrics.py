@@ -19,7 +19,15 @@ import numpy as np
 import polars as pl
 
 from ..algorithms.contract import FloatArray
-from .alignment import IntArray, Matches, Transform, align, match, wrap, yaw_of
+from .alignment import (
+    IntArray,
+    Matches,
+    Transform,
+    align,
+    match,
+    wrap,
+    yaw_of,
+)
 
 POSITION = ("pos_x", "pos_y", "pos_z")
 QUATERNION = ("quat_w", "quat_x", "quat_y", "quat_z")

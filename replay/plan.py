@@ -14,7 +14,13 @@ from typing import Any
 import msgspec
 
 from ..algorithms import find, make
-from ..algorithms.contract import AlgorithmError, Estimator, Input, Output, PlainEstimator
+from ..algorithms.contract import (
+    AlgorithmError,
+    Estimator,
+    Input,
+    Output,
+    PlainEstimator,
+)
 from ..recording.errors import Finding, UsageError
 from .sources import PlannedChannel, Source
 

@@ -12,9 +12,19 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from ..algorithms.contract import FloatArray, KernelEstimator, input_columns, output_columns
+from ..algorithms.contract import (
+    FloatArray,
+    KernelEstimator,
+    input_columns,
+    output_columns,
+)
 from ..recording.errors import Finding, MarchaError
-from .blocks import Block, Columns, by_columns, joined
+from .blocks import (
+    Block,
+    Columns,
+    by_columns,
+    joined,
+)
 from .feed import Feed, IntArray, Rows
 from .plan import PlannedRun
 

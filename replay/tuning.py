@@ -11,7 +11,12 @@ from typing import Any, Literal
 import numpy as np
 import polars as pl
 
-from ..algorithms import AlgorithmError, describe, find, make
+from ..algorithms import (
+    AlgorithmError,
+    describe,
+    find,
+    make,
+)
 from ..recording import Recording
 from ..recording.errors import UsageError
 from .api import replay as replay_recording

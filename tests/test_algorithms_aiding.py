@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from marcha.algorithms import AlgorithmError, aiding, foot, foot_9iez, make, strapdown
-from marcha.algorithms import layout as la
+from marcha.algorithms import AlgorithmError, make
+from marcha.algorithms.foot import aiding, iez9, strapdown
+from marcha.algorithms.foot import common as foot
+from marcha.algorithms.foot import layout as la
 from scipy.spatial.transform import Rotation
 
 from . import algorithms_reference as ref
@@ -156,12 +158,12 @@ def test_without_aids_the_filter_is_the_sources_to_the_bit() -> None:
         r = foot.release(s)
         if not foot.starts(s) and s[la.STARTED] > 0.5:
             strapdown.advance(s, r)
-            foot_9iez.predict(s, s[r + la.R_DT])
+            iez9.predict(s, s[r + la.R_DT])
             if s[r + la.R_STILL] > 0.5:
-                foot_9iez.zero_velocity(s, 0)
+                iez9.zero_velocity(s, 0)
         foot.emit(s, r, out)
-        foot.emit_sigma(s, foot_9iez.P, foot_9iez.N, foot_9iez.XPOS, foot_9iez.XVEL, foot_9iez.ATT, out)
-        foot.emit_detector(s, r, foot_9iez.FIRST_DETECTOR, out)
+        foot.emit_sigma(s, iez9.P, iez9.N, iez9.XPOS, iez9.XVEL, iez9.ATT, out)
+        foot.emit_detector(s, r, iez9.FIRST_DETECTOR, out)
         result.append(out.copy())
 
     for row in rows:

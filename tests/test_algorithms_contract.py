@@ -97,8 +97,9 @@ def test_interpreted_gives_the_same_bits(tmp_path: Path) -> None:
 
 def test_kernels_count_no_references() -> None:
     # Counting is atomic, for every array handed over and every view of a row: it doubled a sample's time.
-    names = [m.name for m in pkgutil.iter_modules(algorithms.__path__)]
-    modules = [import_module(f"marcha.algorithms.{name}") for name in names]
+    modules = [
+        import_module(m.name) for m in pkgutil.walk_packages(algorithms.__path__, "marcha.algorithms.")
+    ]
     compiled = [
         f
         for module in modules

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from marcha.algorithms import make
-from marcha.algorithms.detectors import CLEANINGS, KINDS, STATISTICS
+from marcha.algorithms.foot.detectors import CLEANINGS, KINDS, STATISTICS
 
 from .algorithms_support import columns, rows_of, run, simulated
 

@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from marcha.algorithms import foot_9iez, foot_9iez_mad, foot_15iez_zaru, kalman, make, rotations
-from marcha.algorithms import layout as la
+from marcha.algorithms import make
+from marcha.algorithms.foot import iez9 as foot_9iez
+from marcha.algorithms.foot import iez9_mad as foot_9iez_mad
+from marcha.algorithms.foot import iez15_zaru as foot_15iez_zaru
+from marcha.algorithms.foot import layout as la
+from marcha.algorithms.numerics import kalman, rotations
 from scipy.spatial.transform import Rotation
 
 from . import algorithms_reference as ref

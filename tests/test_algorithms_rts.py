@@ -41,7 +41,7 @@ def matched_walk(seed: int) -> tuple[np.ndarray, Any]:
 
 def test_equals_the_textbook_recursion() -> None:
     """Rauch–Tung–Striebel with a pseudo-inverse, from the filter's logged covariances."""
-    from marcha.algorithms import foot_rts as f
+    from marcha.algorithms.foot import rts as f
 
     rows, _ = simulated("rectangle", seed=2)
     rows = rows[:620]

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from marcha.algorithms import foot_ukf, make
-from marcha.algorithms import layout as la
-from marcha.algorithms.foot_9iez import P
+from marcha.algorithms import make
+from marcha.algorithms.foot import layout as la
+from marcha.algorithms.foot import ukf as foot_ukf
+from marcha.algorithms.foot.iez9 import P
 from scipy.spatial.transform import Rotation
 
 from .algorithms_support import columns, run, simulated

@@ -235,7 +235,7 @@ def test_a_restless_vicon_start_is_stated(data_dir: Path) -> None:
 def test_footprints_agree(data_dir: Path, name: str) -> None:
     """33 strides measured with a ruler (their y is mirrored, too)."""
     table = np.genfromtxt(data_dir / "foot/footprints/SensorConnectData_31.csv", delimiter=",", skip_header=1)
-    (file,) = (data_dir / "foot/footprints").glob("*strideIndex*.csv")
+    (file,) = (data_dir / "foot/footprints").glob("SensorConnectData_31_stride*.csv")
     prints = np.genfromtxt(file, delimiter=",", skip_header=1)
     result, _ = run(name, rows_of(table[:, 0], table[:, 1:4] * 9.80665, table[:, 4:7]), rate_hz=200.0)
     at = prints[:, 0].astype(int)

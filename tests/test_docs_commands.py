@@ -10,7 +10,7 @@ from typing import Any
 
 import marcha.recording as mr
 import marcha.replay as rp
-import marcha.replay.study as study
+import marcha.study as study
 import marcha.viz as viz
 import polars as pl
 import pytest

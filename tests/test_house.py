@@ -12,13 +12,14 @@ import pytest
 
 from .conftest import ROOT
 
-ROOMS = ("ingest", "recording", "algorithms", "replay", "viz", "export", "cli")
+ROOMS = ("ingest", "recording", "algorithms", "replay", "study", "viz", "export", "cli")
 MAY_IMPORT = {
     "recording": set(),
     "algorithms": set(),
     "ingest": {"recording"},
     "export": {"recording"},
     "replay": {"recording", "algorithms"},
+    "study": {"recording", "algorithms", "replay", "ingest", "viz"},
     "viz": {"recording", "replay", "export"},  # export: only for the contract that its RRD exporter fulfils
     "cli": set(ROOMS) - {"cli"},
 }

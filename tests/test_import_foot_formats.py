@@ -14,13 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from marcha.ingest import Import, Report
 from marcha.ingest.contract import ReportBuilder
+from marcha.ingest.formats.sensorconnect_csv import SensorConnectCsv
+from marcha.ingest.formats.vicon_mat import ViconMat
+from marcha.ingest.formats.ximu_csv import XimuCsv
+from marcha.ingest.formats.xio_csv import XioCsv
 from marcha.ingest.inertial import Plateau
 from marcha.ingest.registry import make_options
-from marcha.ingest.sensorconnect_csv import SensorConnectCsv
 from marcha.ingest.simulate import Walk, walk
-from marcha.ingest.vicon_mat import ViconMat
-from marcha.ingest.ximu_csv import XimuCsv
-from marcha.ingest.xio_csv import XioCsv
 from marcha.recording import MarchaError, UsageError
 from scipy.spatial.transform import Rotation
 

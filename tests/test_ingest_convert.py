@@ -23,8 +23,8 @@ from marcha.ingest import (
     Import,
     ReportBuilder,
     convert,
-    formats,
     importers,
+    known_formats,
     recognise,
     registry,
 )
@@ -285,7 +285,7 @@ def test_real_recordings_convert_whole(data_dir: Path, tmp_path: Path) -> None:
 
 
 def test_formats_document_their_options() -> None:
-    known = {f.name: f for f in formats()}
+    known = {f.name: f for f in known_formats()}
     assert {"mpu6050-serial", "mpu6050-packets", "table"} <= set(known)
     for info in known.values():
         assert info.title

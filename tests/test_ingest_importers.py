@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import ClassVar
 
-from marcha.ingest.mpu6050_packets import Mpu6050Packets
-from marcha.ingest.mpu6050_serial import Mpu6050Serial
+from marcha.ingest.formats.mpu6050_packets import Mpu6050Packets
+from marcha.ingest.formats.mpu6050_serial import Mpu6050Serial
+from marcha.ingest.formats.table import Table
 from marcha.ingest.simulate import simulate
-from marcha.ingest.table import Table
 
 from .contracts.importer import ImporterContract
 

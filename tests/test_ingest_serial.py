@@ -13,9 +13,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from marcha.ingest import Report
-from marcha.ingest.mpu6050 import Mpu6050Options
-from marcha.ingest.mpu6050_packets import Mpu6050Packets
-from marcha.ingest.mpu6050_serial import Mpu6050Serial
+from marcha.ingest.formats.mpu6050 import Mpu6050Options
+from marcha.ingest.formats.mpu6050_packets import Mpu6050Packets
+from marcha.ingest.formats.mpu6050_serial import Mpu6050Serial
 from marcha.ingest.simulate import simulate
 from marcha.recording import MarchaError, UsageError
 

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from marcha.ingest import Report, convert
-from marcha.ingest.table import Table, TableOptions
+from marcha.ingest.formats.table import Table, TableOptions
 from marcha.ingest.units import UNITS, conversion
 from marcha.recording import MarchaError, UsageError
 

@@ -12,7 +12,7 @@ from typing import Any
 import marcha.recording as mr
 import numpy as np
 import pytest
-from marcha.ingest import convert, formats, registry
+from marcha.ingest import convert, known_formats, registry
 
 from .conftest import ROOT
 from .contracts.importer import ImporterContract
@@ -49,7 +49,7 @@ def test_found_by_its_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(registry, "entry_points", lambda group: EntryPoints([*real, extra]))
     registry.importers.cache_clear()
     try:
-        assert "gaitbox" in {f.name for f in formats()}
+        assert "gaitbox" in {f.name for f in known_formats()}
         source = TestGaitBox().sample(tmp_path)
         done = convert(source, tmp_path / "log.mcap", options={"side": "right"})
     finally:

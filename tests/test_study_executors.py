@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 from marcha.recording import MarchaError, UsageError
-from marcha.replay.study import executors
-from marcha.replay.study.executors import SINGLE_THREAD, Executor
+from marcha.study import executors
+from marcha.study.executors import SINGLE_THREAD, Executor
 
 
 def double(task: int) -> int:

@@ -20,11 +20,11 @@ from marcha.ingest.simulate import simulate
 from marcha.recording import UsageError
 from marcha.recording import open as open_recording
 from marcha.replay import replay
-from marcha.replay.study import StudyConfig, StudyResult, gallery, plan, run_study
-from marcha.replay.study import study as study_module
-from marcha.replay.study.cells import cached
-from marcha.replay.study.config import Recordings
-from marcha.replay.study.plan import find_sources
+from marcha.study import StudyConfig, StudyResult, gallery, plan, run_study
+from marcha.study import study as study_module
+from marcha.study.cells import cached
+from marcha.study.config import Recordings
+from marcha.study.plan import find_sources
 
 CONFIG = """
 title = "Two <filters> & two sensors"
@@ -377,7 +377,7 @@ def test_without_dask_one_line_names_the_extra(monkeypatch: pytest.MonkeyPatch, 
 
 def test_importing_the_study_loads_nothing_heavy() -> None:
     heavy = ("dask", "matplotlib", "scipy.stats", "rerun")
-    code = f"import marcha.replay.study, sys; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import marcha.study, sys; print([m for m in {heavy} if m in sys.modules])"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ
     )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from marcha.replay.study.statistics import (
+from marcha.study.statistics import (
     Comparison,
     compare,
     corrected,

@@ -10,7 +10,16 @@ import rerun as rr
 
 from ..recording import SCHEMAS
 from . import style
-from .scene import ChannelLike, Floats, Scene, Threshold, Times, columns_of, is_estimate, thresholds_of
+from .scene import (
+    ChannelLike,
+    Floats,
+    Scene,
+    Threshold,
+    Times,
+    columns_of,
+    is_estimate,
+    thresholds_of,
+)
 from .track import Track
 
 CLOSED_M = 1.0

@@ -15,7 +15,12 @@ from rerun.blueprint.api import VisualizerLike
 from rerun.encodings import EntityPathLike
 
 from . import plan
-from .scene import TIMELINE, Entry, Floats, Scene
+from .scene import (
+    TIMELINE,
+    Entry,
+    Floats,
+    Scene,
+)
 from .track import STANDING_M, Track, framed
 
 TRAIL_S = 60.0

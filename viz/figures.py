@@ -18,7 +18,13 @@ from ..recording import Recording
 from ..recording.atomic import AtomicFile
 from ..recording.errors import UsageError
 from . import style
-from .track import Compared, Track, compare, framed, reference_of
+from .track import (
+    Compared,
+    Track,
+    compare,
+    framed,
+    reference_of,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

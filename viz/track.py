@@ -8,7 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..replay.alignment import Transform, align, match, yaw_of
+from ..replay.alignment import (
+    Transform,
+    align,
+    match,
+    yaw_of,
+)
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]

@@ -8,7 +8,12 @@ give equal bytes.
 from .gait import Mount, Style
 from .scenarios import SCENARIOS
 from .sensors import IDEAL, ImuErrors
-from .walks import Options, Simulation, Walk, walk
+from .walks import (
+    Options,
+    Simulation,
+    Walk,
+    walk,
+)
 from .writer import Line, Simulated, simulate
 
 __all__ = [

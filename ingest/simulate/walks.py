@@ -13,9 +13,22 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ...recording.errors import UsageError
-from .gait import FloatArray, Gait, Motion, Mount, Style
+from .gait import (
+    FloatArray,
+    Gait,
+    Motion,
+    Mount,
+    Style,
+)
 from .scenarios import SCENARIOS, Route, route
-from .sensors import IDEAL, MPU6050_1, MPU6050_2, STANDARD_GRAVITY, Imu, ImuErrors
+from .sensors import (
+    IDEAL,
+    MPU6050_1,
+    MPU6050_2,
+    STANDARD_GRAVITY,
+    Imu,
+    ImuErrors,
+)
 
 T = TypeVar("T", bound=msgspec.Struct)
 

@@ -1,0 +1,1 @@
+"""Foot-mounted inertial navigation: detectors, strapdown, filters, aids."""

@@ -1,0 +1,1 @@
+"""Indoor positioning from radio signal strength: ranging, trilateration, fingerprints, fusion with steps."""

@@ -1,0 +1,1 @@
+"""Attitude and joint angles of linked segments."""

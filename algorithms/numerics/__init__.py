@@ -1,0 +1,1 @@
+"""What estimators of every domain share: rotations, Kalman filters, compilation."""

@@ -1,0 +1,1 @@
+"""Pedestrian dead reckoning with a phone: attitude, steps, lengths, headings, fusion with fixes."""

@@ -1,0 +1,1 @@
+"""Importers: one module a format, each registered as an entry point ``marcha.importers``."""

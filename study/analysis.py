@@ -1,0 +1,312 @@
+"""From the tidy table of cells to groups, outliers and families of comparisons.
+
+A value is left out as an outlier once, in the finest group it belongs to (filter × detector × configuration),
+and stays out of every pooled group.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import msgspec
+import polars as pl
+
+from ..replay.metrics import nees_bounds
+from . import config as cfg
+from .statistics import (
+    Comparison,
+    Group,
+    compare,
+    corrected,
+    outlier_mask,
+    summarize,
+)
+
+#: What a group is made of; an empty string in a table stands for "all of them together".
+FACTORS = ("filter", "detector", "configuration")
+SUBSETS = ("all", "unclipped", "clipped")
+
+
+def values(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
+    """Return one row a finished cell and metric: its value in the metric's unit, and if it is an outlier.
+
+    Columns: ``metric, unit, filter, detector, configuration, recording, input, clipped, value, outlier``.
+    """
+    done = table.filter(pl.col("status") == "ok")
+    frames: list[pl.DataFrame] = []
+    for metric in config.metrics:
+        if metric.column not in done.columns:
+            continue
+        value = pl.col(metric.column).cast(pl.Float64) * metric.scale
+        frames.append(
+            done.select(
+                pl.lit(cfg.metric_title(metric)).alias("metric"),
+                pl.lit(metric.unit).alias("unit"),
+                *(pl.col(c) for c in (*FACTORS, "recording", "input", "clipped")),
+                (value.abs() if metric.absolute else value).alias("value"),
+            )
+        )
+    if not frames:
+        return pl.DataFrame(
+            schema=dict.fromkeys(["metric", "unit", *FACTORS, "recording", "input"], pl.String)
+        ).with_columns(clipped=pl.lit(False), value=pl.lit(0.0), outlier=pl.lit(False))
+    sigma = config.statistics.outlier_sigma
+    return pl.concat(frames).with_columns(
+        pl.col("value")
+        .map_batches(lambda s: pl.Series(outlier_mask(s.to_numpy(), sigma)), return_dtype=pl.Boolean)
+        .over("metric", *FACTORS)
+        .alias("outlier")
+    )
+
+
+def order(frame: pl.DataFrame, config: cfg.StudyConfig) -> dict[str, list[str]]:
+    """Return the levels of every factor in the order in which they are shown."""
+    methods = cfg.methods(config)
+    present = {f: set(frame[f].to_list()) for f in FACTORS}
+    known = {
+        "filter": dict.fromkeys(m.label for m in methods),
+        "detector": dict.fromkeys(m.detector for m in methods),
+        "configuration": dict.fromkeys(sorted(present["configuration"])),
+    }
+    return {f: [level for level in known[f] if level in present[f]] for f in FACTORS}
+
+
+def _subset(frame: pl.DataFrame, subset: str) -> pl.DataFrame:
+    if subset == "all":
+        return frame
+    return frame.filter(pl.col("clipped") if subset == "clipped" else ~pl.col("clipped"))
+
+
+def groups(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
+    """Summarize every metric by filter, configuration and detector, for all, unclipped and clipped inputs.
+
+    Columns: ``metric, unit, subset``, the factors (empty where pooled) and the fields of
+    :class:`~marcha.study.statistics.Group`.
+    """
+    rows: list[dict[str, Any]] = []
+    pooled = [FACTORS, ("filter", "detector"), ("configuration", "detector")]
+    subsets = SUBSETS if frame["clipped"].n_unique() > 1 else SUBSETS[:1]
+    for subset in subsets:
+        part = _subset(frame, subset)
+        for by in pooled:
+            for key, group in part.group_by(["metric", "unit", *by], maintain_order=True):
+                kept = group.filter(~pl.col("outlier"))["value"].to_numpy()
+                summary = summarize(kept, sigma=0, min_samples=config.statistics.min_samples)
+                summary = msgspec.structs.replace(summary, outliers=int(group["outlier"].sum()))
+                rows.append(
+                    {
+                        "metric": key[0],
+                        "unit": key[1],
+                        "subset": subset,
+                        **dict.fromkeys(FACTORS, ""),
+                        **dict(zip(by, key[2:], strict=True)),
+                        **msgspec.structs.asdict(summary),
+                    }
+                )
+    fields = {f.name: pl.String if f.name == "note" else pl.Float64 for f in msgspec.structs.fields(Group)}
+    fields |= dict.fromkeys(("n", "outliers", "missing"), pl.Int64)
+    schema = {**dict.fromkeys(("metric", "unit", "subset", *FACTORS), pl.String), **fields}
+    return pl.DataFrame(rows, schema=schema)
+
+
+def outliers(frame: pl.DataFrame) -> pl.DataFrame:
+    """Return the values that were left out."""
+    return frame.filter(pl.col("outlier")).select(
+        "metric", *FACTORS, "recording", "input", "value", "unit", "clipped"
+    )
+
+
+def comparisons(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
+    """Compare every pair of levels of one factor, family by family.
+
+    Families, each corrected by Holm on its own: filters within each configuration and pooled; configurations
+    within each filter and pooled (both with the study's first detector); detectors within each filter ×
+    configuration.
+
+    Columns: ``metric, unit, factor`` (what is compared), ``within`` (what is held fixed), ``a, b`` and the
+    fields of :class:`~marcha.study.statistics.Comparison`.
+    """
+    frame = frame.filter(~pl.col("outlier") & pl.col("value").is_finite())
+    levels = order(frame, config)
+    first = levels["detector"][0] if levels["detector"] else ""
+    rows: list[dict[str, Any]] = []
+    for (metric, unit), part in frame.group_by("metric", "unit", maintain_order=True):
+        for factor, fixed in _families(levels, first):
+            family = part.filter(*(pl.col(k) == v for k, v in fixed.items()))
+            samples = {
+                level: family.filter(pl.col(factor) == level)["value"].to_numpy() for level in levels[factor]
+            }
+            present = [level for level in levels[factor] if len(samples[level])]
+            pairs = [(a, b) for i, a in enumerate(present) for b in present[i + 1 :]]
+            options = config.statistics
+            results = [
+                compare(
+                    samples[a],
+                    samples[b],
+                    confidence=options.confidence,
+                    min_samples=options.min_samples,
+                    nonparametric=options.nonparametric,
+                )
+                for a, b in pairs
+            ]
+            within = ", ".join(v for v in fixed.values() if v)
+            for (a, b), result in zip(pairs, corrected(results), strict=True):
+                rows.append(
+                    {
+                        "metric": metric,
+                        "unit": unit,
+                        "factor": factor,
+                        "within": within,
+                        "a": a,
+                        "b": b,
+                        **msgspec.structs.asdict(result),
+                    }
+                )
+    kinds = {
+        f.name: pl.String if f.name == "note" else pl.Float64 for f in msgspec.structs.fields(Comparison)
+    }
+    kinds |= dict.fromkeys(("n_a", "n_b"), pl.Int64)
+    schema = {**dict.fromkeys(("metric", "unit", "factor", "within", "a", "b"), pl.String), **kinds}
+    return pl.DataFrame(rows, schema=schema)
+
+
+def _families(levels: dict[str, list[str]], first: str) -> Iterator[tuple[str, dict[str, str]]]:
+    """Yield (factor that is compared, levels that are held fixed)."""
+    base = {"detector": first}
+    for factor, other in (("filter", "configuration"), ("configuration", "filter")):
+        if len(levels[factor]) < 2:
+            continue
+        for level in levels[other]:
+            yield factor, {other: level, **base}
+        if len(levels[other]) > 1:
+            yield factor, base
+    if len(levels["detector"]) > 1:
+        for label in levels["filter"]:
+            for configuration in levels["configuration"]:
+                yield "detector", {"filter": label, "configuration": configuration}
+
+
+def beside_published(group_table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
+    """Put published means beside the measured ones.
+
+    Columns: ``table, by, metric, unit, filter, detector, configuration, published, published_sd, measured,
+    measured_sd, n, ratio, origin, note``. Measured values are NaN where the study has none.
+    """
+    measured = {
+        (r["metric"], r["filter"], r["detector"], r["configuration"]): r
+        for r in group_table.filter((pl.col("subset") == "all") & (pl.col("configuration") != "")).iter_rows(
+            named=True
+        )
+    }
+    rows: list[dict[str, Any]] = []
+    units = {cfg.metric_title(m): m.unit for m in config.metrics}
+    for table in config.published:
+        for row_label, cells in table.rows.items():
+            label = row_label if table.by == "estimator" else table.estimator
+            detector = row_label if table.by == "detector" else table.detector
+            for configuration, value in cells.items():
+                found = measured.get((table.metric, label, detector, configuration))
+                sd = table.sd.get(row_label, {}).get(configuration)
+                published = value * table.scale
+                rows.append(
+                    {
+                        "table": table.table,
+                        "by": table.by,
+                        "metric": table.metric,
+                        "unit": units[table.metric],
+                        "filter": label,
+                        "detector": detector,
+                        "configuration": configuration,
+                        "published": published,
+                        "published_sd": None if sd is None else sd * table.scale,
+                        "measured": found["mean"] if found else None,
+                        "measured_sd": found["sd"] if found else None,
+                        "n": found["n"] if found else 0,
+                        "ratio": found["mean"] / published if found and published else None,
+                        "origin": table.origin,
+                        "note": table.note,
+                    }
+                )
+    floats = ("published", "published_sd", "measured", "measured_sd")
+    schema = {
+        **dict.fromkeys(("table", "by", "metric", "unit", *FACTORS), pl.String),
+        **dict.fromkeys(floats, pl.Float64),
+        "n": pl.Int64,
+        "ratio": pl.Float64,
+        "origin": pl.String,
+        "note": pl.String,
+    }
+    return pl.DataFrame(rows, schema=schema)
+
+
+def json_rows(frame: pl.DataFrame) -> list[dict[str, Any]]:
+    """Return a table's rows with numbers that JSON can hold: what is not finite becomes null."""
+    return frame.with_columns(
+        pl.col(pl.Float64).replace([float("inf"), float("-inf")], None).fill_nan(None)
+    ).to_dicts()
+
+
+#: Metrics that are NEES, with the dimension of the error.
+NEES = {"nees_position_end": 3, "nees_velocity_end": 3}
+
+
+def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
+    """Test every filter's covariance: mean NEES over walks against its chi-square interval.
+
+    Columns: ``metric, filter, detector, configuration`` (empty: all of the same ``clipped``), ``clipped``
+    (apart, since no filter can know what a sensor did beyond its full scale), ``n, mean, median, low, high,
+    verdict``.
+    """
+    rows: list[dict[str, Any]] = []
+    done = table.filter(pl.col("status") == "ok")
+    for name, dof in NEES.items():
+        if name not in done.columns:
+            continue
+        known = done.filter(pl.col(name).is_finite())
+        for by in (("clipped", "filter", "detector"), ("clipped", *FACTORS)):
+            for key, part in known.group_by(*by, maintain_order=True):
+                mean, n = float(part[name].mean()), part.height  # pyright: ignore[reportArgumentType]
+                low, high = nees_bounds(n, dof, config.statistics.confidence)
+                verdict = (
+                    "consistent" if low <= mean <= high else "too sure" if mean > high else "too careful"
+                )
+                rows.append(
+                    {
+                        "metric": name,
+                        **dict.fromkeys(FACTORS, ""),
+                        **dict(zip(by, key, strict=True)),
+                        "n": n,
+                        "mean": mean,
+                        "median": part[name].median(),
+                        "low": low,
+                        "high": high,
+                        "verdict": verdict,
+                    }
+                )
+    schema = {
+        **dict.fromkeys(("metric", *FACTORS), pl.String),
+        "clipped": pl.Boolean,
+        "n": pl.Int64,
+        **dict.fromkeys(("mean", "median", "low", "high"), pl.Float64),
+        "verdict": pl.String,
+    }
+    return pl.DataFrame(rows, schema=schema).sort("clipped", maintain_order=True)
+
+
+def remarks(cells: Sequence[Any], config: cfg.StudyConfig) -> list[str]:
+    """Return what a reader must know before the numbers: failed cells, metrics that no cell has."""
+    notes = [
+        f"failed: {c.recording}{f' {c.input}' if c.input else ''}, {c.label} {c.detector}: {c.error}"
+        for c in cells
+        if c.status != "ok"
+    ]
+    if len(notes) > 12:
+        notes = [*notes[:12], f"{len(notes) - 12} more cells failed; `error` in results.csv says why"]
+    have = {name for c in cells for name in c.metrics} | {"run_time_s", "samples", "clipped_readings"}
+    notes += [
+        f"no cell has the metric {m.column} ({cfg.metric_title(m)}): is its truth known (closed, length_m)?"
+        for m in config.metrics
+        if m.column not in have
+    ]
+    return notes

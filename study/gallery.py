@@ -1,0 +1,126 @@
+"""Which figures a study has, and having them drawn by the processes that are there.
+
+What they look like is in :mod:`~marcha.study.figures`, which only those who draw import.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import msgspec
+import polars as pl
+
+from . import config as cfg
+from .analysis import order
+from .cells import Cell
+from .executors import Executor
+from .report import Picture
+
+
+class Drawing(msgspec.Struct, frozen=True):
+    """A figure to be drawn, in any process.
+
+    Attributes
+    ----------
+    name, section, caption : str
+        See :class:`~marcha.study.report.Picture`.
+    function : str
+        Name of the function of :mod:`~marcha.study.figures` that returns it, or None.
+    arguments : tuple
+        Its arguments.
+    """
+
+    name: str
+    section: str
+    caption: str
+    function: str
+    arguments: tuple[Any, ...]
+
+
+def drawings(
+    frame: pl.DataFrame, nees: pl.DataFrame, cells: Sequence[Cell], config: cfg.StudyConfig
+) -> list[Drawing]:
+    """Return all that the study has to show, in the order of the report; see :func:`draw`."""
+    levels = order(frame, config)
+    first = levels["detector"][0] if levels["detector"] else ""
+    detector = f", detector {first}" if first else ""
+    found: list[Drawing] = []
+    for metric in config.metrics:
+        title = cfg.metric_title(metric)
+        whole = frame.filter((pl.col("metric") == title) & pl.col("value").is_finite())
+        part = whole.filter(pl.col("detector") == first)
+        if not len(part):
+            continue
+        stem = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
+        section = "run time" if metric.column == "run_time_s" else "box"
+        for factor in ("filter", "configuration"):
+            if len(levels[factor]) > 1:
+                caption = f"{title} by {factor}, all other factors together{detector}."
+                arguments = (part, config, factor, metric.log)
+                found.append(Drawing(f"box-{stem}-{factor}", section, caption, "box_by", arguments))
+        if len(levels["filter"]) > 1 and len(levels["configuration"]) > 1:
+            caption = f"{title} by configuration and filter{detector}."
+            arguments = (part, config, metric.log)
+            found.append(Drawing(f"box-{stem}-both", section, caption, "box_by_both", arguments))
+        if section == "run time":
+            continue
+        if len(levels["detector"]) > 1:
+            caption = f"{title} by detector, all filters and configurations together."
+            arguments = (whole, config, "detector", metric.log)
+            found.append(Drawing(f"box-{stem}-detector", section, caption, "box_by", arguments))
+        caption = f"{title}: ordered values against normal quantiles; on the line they are normal{detector}."
+        found.append(Drawing(f"qq-{stem}", "qq", caption, "qq", (part, config)))
+    own = [c for c in cells if c.detector == first]
+    if config.tracks and own:
+        caption = f"Tracks seen from above: start at the cross, dots where they end{detector}."
+        if any(c.clipped for c in own):
+            caption += " Dashed: clipped input."
+        found.append(Drawing("tracks", "tracks", caption, "tracks", (own, config)))
+    single = nees.filter((pl.col("configuration") != "") & (pl.col("detector") == first))
+    if len(single):
+        caption = f"Mean NEES over the walks{detector}; above the band a filter is too sure of itself."
+        found.append(Drawing("consistency", "consistency", caption, "consistency", (single, config)))
+    return found
+
+
+def render(drawing: Drawing) -> Picture | None:
+    """Draw one figure; None where there is nothing to see."""
+    from . import figures
+
+    images = figures.images(getattr(figures, drawing.function), *drawing.arguments)
+    return None if images is None else Picture(drawing.name, drawing.section, drawing.caption, *images)
+
+
+def draw(
+    executor: Executor,
+    values: pl.DataFrame,
+    consistency: pl.DataFrame,
+    cells: Sequence[Cell],
+    config: cfg.StudyConfig,
+    meanwhile: Callable[[], object] = lambda: None,
+) -> list[Picture]:
+    """Draw every figure, by the processes that are there.
+
+    Parameters
+    ----------
+    executor : Executor
+        Runs the drawing.
+    values, consistency : polars.DataFrame
+        Tables of :mod:`~marcha.study.analysis`.
+    cells : sequence of Cell
+        Their tracks are drawn.
+    config : StudyConfig
+        The study.
+    meanwhile : callable, optional
+        See :meth:`Executor.run`.
+    """
+    todo = drawings(values, consistency, cells, config)
+    done: dict[str, Picture | None] = {}
+    # From the end of the report, where the largest figures stand: none of them is begun last.
+    for drawing, outcome in executor.run(render, todo[::-1], meanwhile):
+        if isinstance(outcome, Exception):
+            raise outcome
+        done[drawing.name] = outcome
+    return [picture for d in todo if (picture := done[d.name]) is not None]

@@ -1,0 +1,295 @@
+"""From a configuration to tasks: which recordings there are, which cells they need, and what names a cell.
+
+A cell's key is a hash of everything that its result depends on: the recording's content, how it is converted,
+the inputs, the estimator with its parameters, and the code. Cells with a known key are never run again.
+"""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import inspect
+import random
+import sys
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from ..algorithms import available, make
+from ..algorithms.contract import AlgorithmError
+from ..recording import UsageError
+from . import config as cfg
+
+
+class Source(msgspec.Struct, frozen=True):
+    """One recording of the study.
+
+    Attributes
+    ----------
+    name : str
+        Name in tables: the path below the data folder without suffix, or scenario, configuration and number.
+    kind : str
+        ``mcap``, ``raw`` or ``simulated``.
+    digest : str
+        Hash of the content and of what it is made with.
+    path : str
+        File; empty for a simulated walk.
+    format : str or None
+        Importer of a raw file.
+    options : dict
+        Options of the importer (truth included) or of the simulator.
+    scenario, seed : str, int
+        What to simulate.
+    configuration : str
+        Configuration of a simulated walk, with the scenario before it where there are several; empty where
+        the study's rules decide.
+    size : int
+        Bytes, for ordering.
+    """
+
+    name: str
+    kind: str
+    digest: str
+    path: str = ""
+    format: str | None = None
+    options: dict[str, Any] = {}
+    scenario: str = ""
+    seed: int = 0
+    configuration: str = ""
+    size: int = 0
+
+
+class Job(msgspec.Struct, frozen=True):
+    """One method on one recording: as many cells as inputs.
+
+    Attributes
+    ----------
+    key : str
+        Hash of all that the result depends on.
+    method : Method
+        What runs.
+    """
+
+    key: str
+    method: cfg.Method
+
+
+class Task(msgspec.Struct, frozen=True):
+    """What one worker does at a time: jobs on one recording, which is read once for all of them.
+
+    Attributes
+    ----------
+    name : str
+        Hash of the jobs' keys, name of the task's file.
+    source : Source
+        The recording.
+    jobs : list of Job
+        What runs on it; empty to only convert it.
+    inputs : list of str
+        Globs of topics.
+    folder : str
+        Where converted and simulated recordings are kept.
+    """
+
+    name: str
+    source: Source
+    jobs: list[Job]
+    inputs: list[str]
+    folder: str
+
+
+def digest(*parts: Any) -> str:
+    """Return a short hash of structures that msgspec can encode; the order of keys does not matter."""
+    data = msgspec.json.encode(parts, order="deterministic")
+    return hashlib.blake2b(data, digest_size=16).hexdigest()
+
+
+def file_digest(path: Path) -> str:
+    """Return the BLAKE2b hash of a file's, or a folder's files', names and content."""
+    total = hashlib.blake2b(digest_size=16)
+    files = sorted(p for p in path.rglob("*") if p.is_file()) if path.is_dir() else [path]
+    for file in files:
+        if path.is_dir():
+            total.update(str(file.relative_to(path)).encode())
+        with file.open("rb") as handle:
+            total.update(hashlib.file_digest(handle, lambda: hashlib.blake2b(digest_size=16)).digest())
+    return total.hexdigest()
+
+
+def code_digest(estimators: Iterable[str]) -> str:
+    """Return a hash of the code that results depend on: marcha's rooms and version, plug-ins' modules."""
+    root = Path(__file__).parents[2]
+    files = [p for room in ("recording", "ingest", "algorithms") for p in (root / room).rglob("*.py")]
+    files += (root / "replay").glob("*.py")
+    files.append(Path(__file__).with_name("cells.py"))
+    classes = available()
+    for name in sorted(set(estimators)):
+        if name not in classes:
+            raise UsageError(
+                f"{name}: no such estimator; `marcha estimators` lists {', '.join(sorted(classes))}"
+            )
+        source = inspect.getsourcefile(sys.modules[classes[name].__module__])
+        if source is not None and not Path(source).resolve().is_relative_to(root):
+            files.append(Path(source))
+    total = hashlib.blake2b(metadata.version("marcha").encode(), digest_size=16)
+    for file in sorted(files):
+        total.update(file.name.encode() + b"\0" + file.read_bytes())
+    return total.hexdigest()
+
+
+def find_sources(
+    config: cfg.StudyConfig, data: Path | Sequence[Path] | None, code: str
+) -> tuple[list[Source], list[str]]:
+    """Return the study's recordings in the order of their names, and remarks about what was left out.
+
+    Raises
+    ------
+    UsageError
+        For a missing data folder or globs that match nothing.
+    """
+    sources: list[Source] = []
+    notes: list[str] = []
+    if config.recordings is not None:
+        found, notes = _files(config.recordings, data)
+        for name, path in found:
+            sources.append(_source(config.recordings, name, path, code))
+    if config.simulate is not None:
+        sources += _walks(config.simulate, code)
+    return sources, notes
+
+
+def _files(
+    recordings: cfg.Recordings, data: Path | Sequence[Path] | None
+) -> tuple[list[tuple[str, Path]], list[str]]:
+    if data is None:
+        raise UsageError("the study reads recordings; say where they are with --data FOLDER")
+    roots = [data] if isinstance(data, Path) else list(data)
+    names: dict[str, Path] = {}
+    notes: list[str] = []
+    for root in roots:
+        if not root.exists():
+            raise UsageError(f"{root}: no such file or folder; give the folder of the recordings with --data")
+        base = root if root.is_dir() else root.parent
+        found = sorted({p for g in recordings.files for p in root.glob(g)}) if root.is_dir() else [root]
+        # The truth of a simulated walk stands beside its log and belongs to it.
+        for path in (p for p in found if p.is_file() and ".truth." not in p.name):
+            name = str(path.relative_to(base).with_suffix("").as_posix())
+            other = names.get(name)
+            if other is None:
+                names[name] = path
+            elif ".mcap" in (path.suffix, other.suffix) and path.suffix != other.suffix:
+                names[name] = path if path.suffix == ".mcap" else other
+                raw = other if path.suffix == ".mcap" else path
+                notes.append(
+                    f"{raw.name} is left out: {names[name].name} beside it is taken for the same walk"
+                )
+            else:
+                raise UsageError(
+                    f"{path}: {other} has the same name {name!r}; narrow `files` in [recordings]"
+                )
+    if not names:
+        where = ", ".join(str(r) for r in roots)
+        raise UsageError(f"{where}: no file matches {', '.join(recordings.files)}; check --data and `files`")
+    return sorted(names.items()), notes
+
+
+def _source(recordings: cfg.Recordings, name: str, path: Path, code: str) -> Source:
+    raw = path.suffix != ".mcap"
+    beside = sorted(path.parent.glob(f"{glob.escape(path.stem)}.truth.*")) if raw else []
+    known = cfg.Truth() if beside else cfg.truth(recordings, path.name)  # what a walk knows of itself counts
+    truth = {k: v for k, v in (("closed", known.closed), ("length_m", known.length_m)) if v is not None}
+    options = {**truth, **recordings.options} if raw else truth
+    content = [file_digest(p) for p in (path, *beside)]
+    return Source(
+        name=name,
+        kind="raw" if raw else "mcap",
+        digest=digest(content, path.name, recordings.format if raw else None, options, code),
+        path=str(path.resolve()),
+        format=recordings.format if raw else None,
+        options=options,
+        size=path.stat().st_size,
+    )
+
+
+def _walks(simulate: cfg.Simulate, code: str) -> list[Source]:
+    walks: list[Source] = []
+    several = len(simulate.scenarios) > 1
+    for scenario in simulate.scenarios:
+        for label, sensor in simulate.configurations.items():
+            for number in range(1, simulate.walks + 1):
+                seed = simulate.seed + len(walks)
+                draw = random.Random(seed)
+                varied = {k: draw.uniform(*simulate.vary[k]) for k in sorted(simulate.vary)}
+                options = {**simulate.options, **varied, **sensor}
+                walks.append(
+                    Source(
+                        name=f"{scenario}-{label}-{number:03d}",
+                        kind="simulated",
+                        digest=digest(scenario, seed, options, code),
+                        options=options,
+                        scenario=scenario,
+                        seed=seed,
+                        configuration=f"{scenario} {label}" if several else label,
+                    )
+                )
+    return walks
+
+
+def jobs(config: cfg.StudyConfig, source: Source) -> list[Job]:
+    """Return every method on one recording with its key."""
+    return [
+        Job(digest(source.digest, source.name, config.inputs, method), method)
+        for method in cfg.methods(config)
+    ]
+
+
+def check_methods(methods: Iterable[cfg.Method]) -> None:
+    """Build every estimator once.
+
+    Raises
+    ------
+    UsageError
+        Where a name, preset or parameter is wrong: before anything runs.
+    """
+    for method in methods:
+        try:
+            make(method.estimator, preset=method.preset or None, **method.params)
+        except AlgorithmError as error:
+            raise UsageError(f"study: {error}") from None
+
+
+def tasks(
+    config: cfg.StudyConfig, sources: Sequence[Source], done: Iterable[str], folder: Path, processes: int
+) -> list[Task]:
+    """Return what is left to do: a task a recording, more where recordings are fewer than processes."""
+    finished = set(done)
+    left = [(s, [j for j in jobs(config, s) if j.key not in finished]) for s in sources]
+    left = [(s, js) for s, js in left if js]
+    pieces = max(1, -(-4 * processes // len(left))) if left and len(left) < 2 * processes else 1
+    result: list[Task] = []
+    for source, todo in left:
+        size = -(-len(todo) // pieces)
+        for start in range(0, len(todo), size):
+            part = todo[start : start + size]
+            result.append(
+                Task(
+                    name=digest([j.key for j in part]),
+                    source=source,
+                    jobs=part,
+                    inputs=config.inputs,
+                    folder=str(folder),
+                )
+            )
+    # The largest first: no long task is left for the end.
+    return sorted(result, key=lambda t: (-t.source.size, t.source.name))
+
+
+def preparations(todo: Sequence[Task]) -> list[Task]:
+    """Return a task without jobs for every recording that several tasks share: it is made once, first."""
+    counts = Counter(task.source.name for task in todo)
+    shared = {task.source.name: task for task in todo if counts[task.source.name] > 1}
+    return [msgspec.structs.replace(task, jobs=[]) for task in shared.values()]

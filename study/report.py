@@ -1,0 +1,538 @@
+"""The study's report: one HTML file with its tables and pictures inside, readable without a network."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Iterable, Sequence
+from html import escape
+from importlib import resources
+from string import Template
+from typing import Any
+
+import msgspec
+import polars as pl
+
+from . import config as cfg
+from .analysis import order
+
+
+class Picture(msgspec.Struct, frozen=True):
+    """A drawn figure.
+
+    Attributes
+    ----------
+    name : str
+        File name without suffix.
+    section : str
+        Part of the report that it belongs to.
+    caption : str
+        What it shows, for the report and for readers who cannot see it.
+    png, svg : bytes
+        The picture.
+    """
+
+    name: str
+    section: str
+    caption: str
+    png: bytes
+    svg: bytes
+
+
+class Material(msgspec.Struct, frozen=True):
+    """Everything that the report is made of.
+
+    Attributes
+    ----------
+    config : StudyConfig
+        The study.
+    results, values, groups, comparisons, outliers, published, consistency : polars.DataFrame
+        Tables of :mod:`~marcha.study.analysis`.
+    notes : list of str
+        What a reader must know before the numbers.
+    provenance : dict
+        Versions, times, machine.
+    toml : str
+        The resolved configuration.
+    """
+
+    config: cfg.StudyConfig
+    results: pl.DataFrame
+    values: pl.DataFrame
+    groups: pl.DataFrame
+    comparisons: pl.DataFrame
+    outliers: pl.DataFrame
+    published: pl.DataFrame
+    consistency: pl.DataFrame
+    notes: list[str]
+    provenance: dict[str, Any]
+    toml: str
+
+
+NEES_TITLES = {"nees_position_end": "position at the end", "nees_velocity_end": "velocity at the end"}
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Return a number with ``digits`` significant digits, or a dash where there is none."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    exponent = math.floor(math.log10(abs(value)))
+    if -4 <= exponent < 5:
+        return f"{value:.{max(0, digits - 1 - exponent)}f}"
+    return f"{value:.{digits - 1}e}"
+
+
+def probability(value: float | None) -> str:
+    """Return a p value as it is written in papers."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    return "&lt; 0.001" if value < 0.001 else f"{value:.3f}"
+
+
+def mean_sd(row: dict[str, Any] | None) -> str:
+    """Return ``mean ± sd`` of a group's row, the sd with the decimals of the mean."""
+    if row is None or not row["n"]:
+        return "–"
+    text = number(row["mean"])
+    if row["n"] < 2:
+        return text
+    decimals = len(text.partition(".")[2]) if "e" not in text else None
+    sd = number(row["sd"]) if decimals is None else f"{row['sd']:.{decimals}f}"
+    return f"{text} ± {sd}"
+
+
+class Html:
+    """Collects the body of the page."""
+
+    def __init__(self) -> None:
+        self.parts: list[str] = []
+        self.sections: list[tuple[str, str]] = []
+
+    def section(self, title: str) -> None:
+        """Start a section."""
+        name = f"s{len(self.sections) + 1}"
+        self.sections.append((name, title))
+        self.parts.append(f'<h2 id="{name}">{escape(title)}</h2>')
+
+    def heading(self, title: str) -> None:
+        """Start a part of a section."""
+        self.parts.append(f"<h3>{escape(title)}</h3>")
+
+    def text(self, text: str, kind: str = "") -> None:
+        """Add a paragraph of plain text."""
+        self.parts.append(f"<p{f' class={kind}' if kind else ''}>{escape(text)}</p>")
+
+    def warning(self, lines: Sequence[str]) -> None:
+        """Add lines that must be seen."""
+        if lines:
+            items = "<br>".join(escape(line) for line in lines)
+            self.parts.append(f'<div class="warning">{items}</div>')
+
+    def table(self, head: Sequence[str], rows: Iterable[Sequence[str]], text_columns: int = 1) -> None:
+        """Add a table; cells are HTML already, the first ``text_columns`` columns are words.
+
+        A row of one cell is a heading across the table. A cell that starts with ``@class `` has that class.
+        """
+
+        def cell(tag: str, index: int, content: str) -> str:
+            classes = ["text"] if index < text_columns else []
+            if content.startswith("@"):
+                extra, _, content = content[1:].partition(" ")
+                classes.append(extra)
+            attribute = f' class="{" ".join(classes)}"' if classes else ""
+            return f"<{tag}{attribute}>{content}</{tag}>"
+
+        out = [
+            '<div class="scroll"><table><tr>',
+            *(cell("th", i, escape(h)) for i, h in enumerate(head)),
+            "</tr>",
+        ]
+        for row in rows:
+            if len(row) == 1:
+                out.append(f'<tr class="section"><td colspan="{len(head)}">{row[0]}</td></tr>')
+            else:
+                out += ["<tr>", *(cell("td", i, c) for i, c in enumerate(row)), "</tr>"]
+        self.parts.append("".join([*out, "</table></div>"]))
+
+    def pictures(self, pictures: Iterable[Picture]) -> None:
+        """Add pictures with their captions."""
+        for picture in pictures:
+            data = base64.b64encode(picture.png).decode()
+            caption = escape(picture.caption)
+            self.parts.append(
+                f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
+                f"<figcaption>{caption}</figcaption></figure>"
+            )
+
+    def body(self) -> str:
+        """Return the page's body with its table of contents under the introduction."""
+        links = "".join(f'<a href="#{name}">{escape(title)}</a>' for name, title in self.sections)
+        first = next((i for i, part in enumerate(self.parts) if part.startswith("<h2")), len(self.parts))
+        return "\n".join([*self.parts[:first], f"<nav>{links}</nav>", *self.parts[first:]])
+
+
+def render(material: Material, pictures: Sequence[Picture]) -> str:
+    """Return the report as one HTML page."""
+    html = Html()
+    _introduction(html, material)
+    levels = order(material.values, material.config)
+    if len(material.values):
+        _means(html, material, levels)
+        if len(levels["detector"]) > 1 or material.values["clipped"].n_unique() > 1:
+            _methods(html, material, levels)
+        for title, section in (("Box plots", "box"), ("Tracks", "tracks"), ("Run time", "run time")):
+            _gallery(html, pictures, title, section)
+        if len(material.consistency):
+            _consistency(html, material, pictures)
+        _normality(html, material, pictures)
+        _comparisons(html, material)
+        _outliers(html, material)
+    _origin(html, material)
+    template = Template(
+        (resources.files(__name__.rpartition(".")[0]) / "report.html").read_text(encoding="utf-8")
+    )
+    return template.substitute(title=escape(material.config.title), body=html.body())
+
+
+def _introduction(html: Html, material: Material) -> None:
+    results = material.results
+    if material.config.description:
+        html.text(material.config.description)
+    walks, clipped = results["recording"].n_unique(), results.filter("clipped")["recording"].n_unique()
+    done = results.filter(pl.col("status") == "ok")
+    html.text(
+        f"{_count(walks, 'recording')}, {_count(results['filter'].n_unique(), 'filter')}, "
+        f"{_count(results['detector'].n_unique(), 'detector')}; "
+        f"{_count(len(done), 'finished cell')}, {len(results) - len(done)} failed; "
+        f"{_count(clipped, 'recording')} with clipped inputs. "
+        f"A cell is one filter with one detector on one input of one recording."
+    )
+    html.warning(material.notes)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _lookup(groups: pl.DataFrame, subset: str = "all") -> dict[tuple[str, str, str, str], dict[str, Any]]:
+    part = groups.filter(pl.col("subset") == subset)
+    return {
+        (r["metric"], r["filter"], r["detector"], r["configuration"]): r for r in part.iter_rows(named=True)
+    }
+
+
+def _means(html: Html, material: Material, levels: dict[str, list[str]]) -> None:
+    html.section("Means by filter and configuration")
+    first = levels["detector"][0]
+    found = _lookup(material.groups)
+    shares = {
+        (r["configuration"],): r["share"]
+        for r in material.results.group_by("configuration")
+        .agg(share=pl.col("clipped").mean())
+        .iter_rows(named=True)
+    }
+    beside = {
+        (r["metric"], r["filter"], r["detector"], r["configuration"]): r["published"]
+        for r in material.published.filter(pl.col("by") == "estimator").iter_rows(named=True)
+    }
+    clipped = ", ".join(
+        f"{c} ({100 * shares[(c,)]:.0f} %)" for c in levels["configuration"] if shares.get((c,))
+    )
+    html.text(
+        "Mean ± standard deviation (n) without outliers"
+        + (f"; detector {first}" if first else "")
+        + (f". Inputs that reached their full scale, by configuration: {clipped}." if clipped else ".")
+    )
+    for metric in material.config.metrics:
+        title = cfg.metric_title(metric)
+        if not any(k[0] == title for k in found):
+            continue
+        tables = [t for t in material.config.published if t.metric == title and t.by == "estimator"]
+        html.heading(f"{title} ({metric.unit})" if metric.unit else title)
+        rows: list[list[str]] = []
+        for name in levels["filter"]:
+            row = [escape(name)]
+            for c in levels["configuration"]:
+                group = found.get((title, name, first, c))
+                n = f' <span class="note">({group["n"]})</span>' if group else ""
+                row.append(mean_sd(group) + n)
+            rows.append([*row, mean_sd(found.get((title, name, first, "")))])
+            known = [beside.get((title, name, first, c)) for c in levels["configuration"]]
+            if any(v is not None for v in known):
+                cells = [f"@published {number(v, 4)}" for v in known]
+                rows.append(["@published published", *cells, "@published "])
+        html.table(["filter", *levels["configuration"], "all"], rows)
+        for table in tables:
+            html.text(f"Published: {table.origin} {table.note}".strip(), "note")
+    if (material.published["by"] == "detector").any():
+        _published_detectors(html, material)
+
+
+def _published_detectors(html: Html, material: Material) -> None:
+    part = material.published.filter(pl.col("by") == "detector")
+    html.heading("Detectors, beside the published means")
+    rows = []
+    for r in part.iter_rows(named=True):
+        measured = {"n": r["n"], "mean": r["measured"], "sd": r["measured_sd"]}
+        published = {
+            "n": 2 if r["published_sd"] is not None else 1,
+            "mean": r["published"],
+            "sd": r["published_sd"],
+        }
+        rows.append(
+            [
+                escape(r["filter"]),
+                escape(r["detector"]),
+                escape(r["configuration"]),
+                escape(f"{r['metric']} ({r['unit']})"),
+                mean_sd(measured),
+                str(r["n"]),
+                f"@published {mean_sd(published)}",
+            ]
+        )
+    html.table(["filter", "detector", "configuration", "metric", "measured", "n", "published"], rows, 4)
+    for note in dict.fromkeys(part["note"].to_list()):
+        if note:
+            html.text(note, "note")
+
+
+def _methods(html: Html, material: Material, levels: dict[str, list[str]]) -> None:
+    html.section("Every filter and detector, clipped inputs apart")
+    html.text(
+        "Mean ± standard deviation over all configurations. An input is clipped where a sensor reached its "
+        "full scale: "
+        "what it did beyond is not in the data, so its errors are not the filter's alone."
+    )
+    titles = [cfg.metric_title(m) for m in material.config.metrics]
+    units = {cfg.metric_title(m): m.unit for m in material.config.metrics}
+    subsets = [s for s in ("unclipped", "clipped") if (material.groups["subset"] == s).any()] or ["all"]
+    rows: list[list[str]] = []
+    for subset in subsets:
+        found = _lookup(material.groups, subset)
+        body: list[list[str]] = []
+        for name in levels["filter"]:
+            for detector in levels["detector"]:
+                entries = [found.get((t, name, detector, "")) for t in titles]
+                if any(entries):
+                    n = max(e["n"] for e in entries if e)
+                    body.append([escape(name), escape(detector), *map(mean_sd, entries), str(n)])
+        if body:
+            rows += [[f"{subset} inputs"], *body]
+    head = [f"{t} ({units[t]})" if units[t] else t for t in titles]
+    html.table(["filter", "detector", *head, "n"], rows, 2)
+
+
+def _gallery(html: Html, pictures: Sequence[Picture], title: str, section: str) -> None:
+    pictures = [p for p in pictures if p.section == section]
+    if pictures:
+        html.section(title)
+        if section == "box":
+            html.text(
+                "Box: quartiles and median; whiskers: last value within 1.5 interquartile ranges; diamond: "
+                "mean; "
+                "dots: single values (all of them in groups below 20; groups below 5 have no box). Outliers "
+                "of the sigma rule are left out."
+            )
+        html.pictures(pictures)
+
+
+def _consistency(html: Html, material: Material, pictures: Sequence[Picture]) -> None:
+    html.section("Consistency of the filters' own covariance")
+    html.text(
+        "NEES: the squared error at the end of the walk in units of the filter's own standard deviations (3 "
+        "on average in space). Its mean over independent walks lies in the interval if "
+        "the filter knows how wrong it is; above it is too sure, below it too careful."
+    )
+    table = material.consistency
+    if table["clipped"].any():
+        html.text(
+            "Clipped inputs stand apart: what a sensor did beyond its full scale is in no model, so there no "
+            "filter can be consistent, and every error counts against it.",
+            "note",
+        )
+    levels = order(table, material.config)
+    for (metric,), errors in table.group_by("metric", maintain_order=True):
+        html.heading(f"{NEES_TITLES.get(str(metric), str(metric))}: mean NEES")
+        rows: list[list[str]] = []
+        for clipped, title in ((False, "unclipped inputs"), (True, "clipped inputs")):
+            part = errors.filter(pl.col("clipped") == clipped)
+            if not len(part):
+                continue
+            shown = [c for c in levels["configuration"] if c and c in part["configuration"]]
+            shown.append("")
+            found = {(r["filter"], r["detector"], r["configuration"]): r for r in part.iter_rows(named=True)}
+            rows.append([title])
+            rows.append(["filter", "detector", *(escape(c) or "all" for c in shown)])
+            for name in levels["filter"]:
+                for detector in levels["detector"]:
+                    entries = [found.get((name, detector, c)) for c in shown]
+                    if any(entries):
+                        rows.append([escape(name), escape(detector), *map(_verdict, entries)])
+            limits = [next(r for r in found.values() if r["configuration"] == c) for c in shown]
+            rows.append(
+                [
+                    "@note consistent within",
+                    "",
+                    *(f"@note {number(r['low'])} … {number(r['high'])} ({r['n']})" for r in limits),
+                ]
+            )
+        width = max(len(r) for r in rows)
+        html.table([""] * width, [r if len(r) == 1 else [*r, *[""] * (width - len(r))] for r in rows], 2)
+    html.pictures(p for p in pictures if p.section == "consistency")
+
+
+def _verdict(row: dict[str, Any] | None) -> str:
+    """Return a mean NEES with its verdict; red where the filter is too sure."""
+    if row is None:
+        return "–"
+    if row["verdict"] == "consistent":
+        return number(row["mean"])
+    mark = "@differs " if row["verdict"] == "too sure" else ""
+    return f"{mark}{number(row['mean'])} {row['verdict']}"
+
+
+def _normality(html: Html, material: Material, pictures: Sequence[Picture]) -> None:
+    html.section("Normality")
+    level = 1 - material.config.statistics.confidence
+    tested = material.groups.filter(
+        (pl.col("subset") == "all") & (pl.col("configuration") != "") & (pl.col("filter") != "")
+    )
+    html.text(
+        f"Shapiro-Wilk for every filter × configuration. Below p = {level:.2f} the values are hardly normal: "
+        "read the "
+        "rank test beside Welch's."
+    )
+    done = tested.filter(pl.col("shapiro_p").is_finite())
+    if len(done) < len(tested):
+        html.text(
+            f"{len(tested) - len(done)} of {len(tested)} groups are not tested: {_reasons(tested)}.", "note"
+        )
+    if len(done):
+        rows = [
+            [
+                escape(r["metric"]),
+                escape(r["filter"]),
+                escape(r["detector"]),
+                escape(r["configuration"]),
+                str(r["n"]),
+                number(r["shapiro_w"], 4),
+                ("@differs " if r["shapiro_p"] < level else "") + probability(r["shapiro_p"]),
+            ]
+            for r in done.iter_rows(named=True)
+        ]
+        head = ["metric", "filter", "detector", "configuration", "n", "W", "p"]
+        _folded(html, f"{len(rows)} groups", head, rows, 4)
+    html.pictures(p for p in pictures if p.section == "qq")
+
+
+def _reasons(frame: pl.DataFrame) -> str:
+    notes = frame.filter(pl.col("note") != "")["note"].value_counts(sort=True)
+    return "; ".join(f"{r['note']} ({r['count']}×)" for r in notes.head(5).iter_rows(named=True))
+
+
+def _folded(html: Html, title: str, head: Sequence[str], rows: list[list[str]], text_columns: int) -> None:
+    html.parts.append(f"<details{' open' if len(rows) <= 30 else ''}><summary>{escape(title)}</summary>")
+    html.table(head, rows, text_columns)
+    html.parts.append("</details>")
+
+
+def _comparisons(html: Html, material: Material) -> None:
+    statistics = material.config.statistics
+    level = 1 - statistics.confidence
+    twin = {"mann-whitney": "Mann-Whitney U", "brunner-munzel": "Brunner-Munzel"}[statistics.nonparametric]
+    html.section("Which means differ")
+    html.text(
+        f"Every pair within a family: Welch's t test and {twin}, two-sided, both corrected by Holm within "
+        "the family, and "
+        f"Hedges' g with its {100 * statistics.confidence:.0f} % interval. Red: below {level:.2f} after the "
+        "correction. "
+        "Filters run on the same walks; the tests treat their values as independent, as the source does, "
+        "which makes "
+        "them careful between filters."
+    )
+    table = material.comparisons
+    done = table.filter(pl.col("welch_p").is_finite())
+    if len(done) < len(table):
+        html.text(
+            f"{len(table) - len(done)} of {len(table)} pairs are not tested: {_reasons(table)}.", "note"
+        )
+    for (factor,), part in done.group_by("factor", maintain_order=True):
+        html.heading(f"Between {factor}s")
+        for (metric,), rows in part.group_by("metric", maintain_order=True):
+            body: list[list[str]] = []
+            for (within,), family in rows.group_by("within", maintain_order=True):
+                body.append([escape(str(within) or "all together")])
+                for r in family.iter_rows(named=True):
+                    marks = ["@differs " if p < level else "" for p in (r["welch_p_holm"], r["rank_p_holm"])]
+                    body.append(
+                        [
+                            escape(f"{r['a']} − {r['b']}"),
+                            f"{r['n_a']}, {r['n_b']}",
+                            f"{number(r['difference'])} ({number(r['difference_low'])} … "
+                            f"{number(r['difference_high'])})",
+                            number(r["welch_t"]),
+                            number(r["welch_df"]),
+                            marks[0] + probability(r["welch_p_holm"]),
+                            f"{number(r['hedges_g'])} ({number(r['hedges_low'])} … "
+                            f"{number(r['hedges_high'])})",
+                            marks[1] + probability(r["rank_p_holm"]),
+                        ]
+                    )
+            unit = rows["unit"][0]
+            title = f"{metric} ({unit})" if unit else str(metric)
+            count = rows.filter(pl.col("welch_p_holm") < level).height
+            head = [
+                "pair",
+                "n",
+                f"difference{f' ({unit})' if unit else ''}",
+                "t",
+                "df",
+                "p (Holm)",
+                "Hedges' g",
+                f"{twin} p (Holm)",
+            ]
+            html.parts.append(
+                f"<details><summary>{escape(title)}: {count} of {len(rows)} pairs differ</summary>"
+            )
+            html.table(head, body)
+            html.parts.append("</details>")
+
+
+def _outliers(html: Html, material: Material) -> None:
+    html.section("Outliers")
+    sigma = material.config.statistics.outlier_sigma
+    if sigma == 0:
+        html.text("No value is left out: the rule is switched off.")
+        return
+    count = len(material.outliers)
+    html.text(
+        f"{count} of {len(material.values)} values lie more than {sigma:g} standard deviations from the mean "
+        "of their filter × "
+        "detector × configuration and are left out of means, plots and tests. "
+        f"Among n values none can lie beyond (n − 1)/√n, so the rule needs {_least(sigma)} values to strike."
+    )
+    if count:
+        head = ["metric", "filter", "detector", "configuration", "recording", "input", "value"]
+        rows = [
+            [*(escape(str(r[c])) for c in head[:-1]), f"{number(r['value'])} {escape(r['unit'])}"]
+            for r in material.outliers.iter_rows(named=True)
+        ]
+        _folded(html, f"{count} values", head, rows, 6)
+
+
+def _least(sigma: float) -> int:
+    n = 2
+    while (n - 1) / math.sqrt(n) <= sigma:
+        n += 1
+    return n
+
+
+def _origin(html: Html, material: Material) -> None:
+    html.section("Provenance")
+    rows = [[escape(k), escape(str(v))] for k, v in material.provenance.items()]
+    html.table(["", ""], rows, 2)
+    html.parts.append(
+        f"<details><summary>Configuration</summary><pre>{escape(material.toml)}</pre></details>"
+    )

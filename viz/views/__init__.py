@@ -1,0 +1,1 @@
+"""What each kind of channel looks like, by domain."""
