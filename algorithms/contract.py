@@ -1,37 +1,57 @@
-"""What an estimator is: parameters, one packed state, one step a sample.
+"""What an estimator is: named inputs, named outputs, and what it does with a message.
 
-An estimator is pure numerics. It knows no file, no clock and no viewer. The engine (``marcha.replay``)
-owns time differences, gaps, missing values, units and frames, and hands over one row of numbers a sample.
+An estimator is pure numerics. It knows no file, no clock and no viewer. The engine (``marcha.replay``) owns
+order, gaps, missing values, units and frames.
 
-The row
-    ``[dt_s, <columns of the first input>, <columns of every further input>]`` as float64, in the units of the
-    recording (m/s², rad/s, T, Pa). ``dt_s`` is the time since the previous row of the first input, 0 for the
-    first. Columns of the first input are always finite. Columns of a further input carry its newest message
-    that arrived since the previous row, and NaN where none arrived: sensors at different rates are joined
-    causally, never interpolated.
+Inputs
+    An estimator declares named inputs (:class:`Input`) by message type and columns, required or optional, one
+    channel or many. Every message of every attached channel reaches it once, in log-time order (ties: by the
+    order of the channels in the recording), with the time that it speaks of. Text, integer and boolean columns
+    keep their types. An input that is ``regular`` (samples of a sensor) is guarded: messages without a finite
+    value or not later than the one before are counted and left out, and the gap policy watches it.
 
-The result
-    one float64 vector in the order of ``outputs`` (all columns of all outputs, one after another), or None
-    where there is nothing to say yet. With ``latency`` L, the result of call k speaks of row k − L; the
-    first L calls return None, and ``flush`` returns the last L results. So a detector may look ahead, and
-    replay stays causal: the engine stamps a result with the time that it speaks of and logs it at the time
-    when it was known. A column that has no value is NaN. An output marked ``event`` exists only where its
-    first column is not NaN.
+Outputs
+    Named as well (:class:`Output`), each with a message type of its own. A message may be answered with any
+    number of results (:class:`Result`), each with the time that it speaks of; it is logged at the time when it
+    was known, so replay stays causal.
+
+Context
+    Before the first message :meth:`PlainEstimator.start` gets the :class:`Context`: attached channels with
+    their measured rates, the recording's metadata, attachments (anchor tables, floor plans), static channels,
+    calibrations. Nothing else comes from outside.
+
+Chains
+    An input may name the estimator that serves it by default (``stage``): its output reaches this input in the
+    same pass, directly after the message that caused it.
+
+Four bases, from the plainest to the fastest; all give the same bits at any speed, in blocks and after a seek:
+:class:`PlainEstimator` (one message at a time, NumPy is enough), :class:`KernelEstimator` (the same as a
+compiled kernel over blocks of merged messages), and, for filters that take one row a sample of one sensor,
+:class:`RowEstimator` and :class:`RowKernel`.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, Self, runtime_checkable
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+if TYPE_CHECKING:
+    import polars as pl
+
+    from .calibration import Calibration
+
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+ALL_COLUMNS = ("*",)
+"""As :attr:`Input.columns`: all columns that the attached channel has (joints or values with names)."""
 
 
 class AlgorithmError(ValueError):
@@ -44,17 +64,55 @@ class Input:
 
     Attributes
     ----------
+    name : str
+        Role: ``imu``, ``thigh``, ``radio`` … ``--input name=topic`` attaches a channel to it.
     schema : str
         Message type of the channels that fit, for example ``sensor_msgs/msg/Imu``.
     columns : tuple of str
-        Columns of that channel's table, in the order of the row.
+        Columns of that channel's table, in the order of a message's values; :data:`ALL_COLUMNS` for all.
     optional : bool
-        Whether the estimator runs without it (its columns are NaN then). Never true for the first input.
+        Whether the estimator runs without it.
+    many : bool
+        Whether every channel that fits is attached, else one. Messages say which channel they come from.
+    regular : bool
+        Whether these are samples of a sensor at a steady rate. Messages that lack a finite value in a column, or
+        whose time is not after that of the channel's message before, are then counted and not handed over, and
+        the gap policy applies. Without it every message is handed over as it is.
+    stage : str
+        Name of the estimator that serves this input where neither the chain nor ``--input`` names another one.
     """
 
+    name: str
     schema: str
     columns: tuple[str, ...]
     optional: bool = False
+    many: bool = False
+    regular: bool = False
+    stage: str = ""
+
+
+@dataclass(frozen=True)
+class Annotate:
+    """How the rows of an output become annotations, in the tier ``<run>/<tier>``.
+
+    Attributes
+    ----------
+    tier : str
+        ``stance``, ``step``, ``turn`` …
+    kind : {"state", "interval", "instant"}
+        ``state``: stretches in which the boolean column ``column`` is true, first to last such row.
+        ``interval``: a row is one, from its column ``start_ns`` to ``end_ns``. ``instant``: a row is one, at its
+        time.
+    column : str
+        See ``state``.
+    label : str
+        Text of an annotation; ``{column}`` stands for a value of the row.
+    """
+
+    tier: str
+    kind: Literal["state", "interval", "instant"]
+    column: str = ""
+    label: str = ""
 
 
 @dataclass(frozen=True)
@@ -70,9 +128,14 @@ class Output:
     columns : tuple of str
         Columns of that message's table.
     event : bool
-        True where a result exists only now and then (a step): rows whose first column is NaN are not written.
+        True where a result exists only now and then (a step). Of a kernel's result vector, rows whose first
+        column is NaN are then not written; of other outputs those that are NaN throughout.
     metadata : tuple of (str, str)
         What the channel's metadata should say, for example thresholds of a detector's statistics.
+    frame : str
+        Frame of the values: ``nav``, or the name of an input for the frame of the channel attached to it.
+    annotate : Annotate or None
+        Where its rows should become annotations too.
     """
 
     name: str
@@ -80,6 +143,8 @@ class Output:
     columns: tuple[str, ...]
     event: bool = False
     metadata: tuple[tuple[str, str], ...] = ()
+    frame: str = "nav"
+    annotate: Annotate | None = None
 
 
 @dataclass(frozen=True)
@@ -101,36 +166,125 @@ class Remark:
     fatal: bool = False
 
 
+class Message(NamedTuple):
+    """One message as an estimator sees it.
+
+    Attributes
+    ----------
+    input : str
+        Name of the input.
+    t_ns : int
+        Time that it speaks of.
+    values : tuple
+        In the order of the input's columns: floats, integers, texts, booleans.
+    log_ns : int
+        Time when it was known.
+    channel : str
+        Topic that it comes from.
+    """
+
+    input: str
+    t_ns: int
+    values: tuple[Any, ...]
+    log_ns: int
+    channel: str
+
+
+class Result(NamedTuple):
+    """One answer: output, time that it speaks of, values in the order of the output's columns."""
+
+    output: str
+    t_ns: int
+    values: Sequence[Any]
+
+
+@dataclass(frozen=True)
+class ChannelInfo:
+    """An attached channel.
+
+    Attributes
+    ----------
+    topic, schema, frame_id : str
+        As in the recording.
+    columns : tuple of str
+        The columns that arrive as a message's values.
+    rate_hz : float
+        Measured on its first samples, or declared by a live source; 0 where it is not known.
+    metadata : mapping of str to str
+        Of the channel.
+    """
+
+    topic: str
+    schema: str
+    frame_id: str = ""
+    columns: tuple[str, ...] = ()
+    rate_hz: float = 0.0
+    metadata: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Context:
+    """What an estimator may know before the first message.
+
+    Attributes
+    ----------
+    channels : mapping of str to tuple of ChannelInfo
+        By input name; empty for an optional input that is not there.
+    metadata : mapping of str to mapping of str to str
+        Metadata records of the recording by name.
+    attachments : mapping of str to bytes
+        By name, read when asked for.
+    static : mapping of str to polars.DataFrame
+        Static channels (frames) by topic.
+    calibrations : mapping of str to Calibration
+        By name of the calibration.
+    """
+
+    channels: Mapping[str, tuple[ChannelInfo, ...]] = field(default_factory=dict)
+    metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    attachments: Mapping[str, bytes] = field(default_factory=dict)
+    static: Mapping[str, pl.DataFrame] = field(default_factory=dict)
+    calibrations: Mapping[str, Calibration] = field(default_factory=dict)
+
+    def has(self, name: str) -> bool:
+        """Return whether a channel is attached to input ``name``."""
+        return bool(self.channels.get(name))
+
+    def rate_hz(self, name: str) -> float:
+        """Return the rate of the first channel of input ``name`` in hertz, 0 where it is not known."""
+        attached = self.channels.get(name)
+        return attached[0].rate_hz if attached else 0.0
+
+
 @runtime_checkable
 class Estimator(Protocol):
     """The least that the engine asks of an estimator; a plain class with NumPy is enough.
 
-    ``step`` takes the row described above and returns the result vector or None. ``inputs`` and ``outputs``
-    may be class attributes or set in ``__init__``. Everything else has a default in :class:`PlainEstimator`.
+    ``take`` gets one message and returns its results. ``inputs`` and ``outputs`` may be class attributes or set
+    in ``__init__`` or ``start``. Everything else has a default in :class:`PlainEstimator`.
     """
 
     name: ClassVar[str]
     inputs: tuple[Input, ...]
     outputs: tuple[Output, ...]
 
-    def step(self, row: FloatArray) -> FloatArray | None:
-        """Take one row, return one result or None."""
+    def take(self, message: Message) -> Iterable[Result] | None:
+        """Take one message, return any number of results."""
         ...
 
 
 class PlainEstimator:
-    """Convenient base of a user's estimator: subclass it, set the class attributes, write ``step``.
+    """Convenient base of a user's estimator: subclass it, set the class attributes, write ``take``.
 
     Attributes
     ----------
     name, inputs, outputs
         See :class:`Estimator`.
-    latency : int
-        Number of rows by which a result lags behind the row that was just taken.
     offline : bool
-        True for smoothers that need the whole recording (``process`` is called once with all rows).
+        True for smoothers that need the whole recording: results come from ``finish`` only, logged at the end.
     Params : type of msgspec.Struct
-        Parameters with unit, effect, default and source in their ``Meta``; built from keyword arguments.
+        Parameters with unit, effect, default and source in their ``Meta``; built from keyword arguments. A
+        parameter ``rate_hz`` whose value is 0 is set to the measured rate of the first input.
     title, source : str
         One line for ``marcha estimators``; author, year and equations.
     """
@@ -148,15 +302,18 @@ class PlainEstimator:
     latency: int = 0
 
     def __init__(self, params: msgspec.Struct | None = None) -> None:
-        self.params = params if params is not None else self.Params()
+        self.params: Any = params if params is not None else self.Params()
 
-    def step(self, row: FloatArray) -> FloatArray | None:
-        """Take one row, return one result or None."""
+    def start(self, context: Context) -> None:
+        """Look at the context, once, before the first message. Raise AlgorithmError where it does not do."""
+
+    def take(self, message: Message) -> Iterable[Result] | None:
+        """Take one message, return any number of results."""
         raise NotImplementedError
 
-    def flush(self) -> FloatArray:
-        """Return the results of the last ``latency`` rows, shape (≤ latency, columns)."""
-        return np.empty((0, len(output_columns(self))))
+    def finish(self) -> Iterable[Result] | None:
+        """Return the results still held back after the last message, or before a restart."""
+        return None
 
     def snapshot(self) -> Any:
         """Return a copy of the state; ``restore`` takes it back."""
@@ -170,21 +327,160 @@ class PlainEstimator:
         """Return what a user must know about the run so far."""
         return []
 
+    @classmethod
+    def make(cls, **params: Any) -> Self:
+        """Build from keyword parameters; see :func:`marcha.algorithms.make`."""
+        return cls(msgspec.convert(params, cls.Params))
+
 
 class KernelEstimator(PlainEstimator):
-    """Base of estimators whose state is one packed float64 buffer and whose step is a numba kernel.
+    """Base of estimators that take merged blocks of messages with a compiled kernel.
 
-    A subclass sets ``kernel(state, row, out) -> bool`` and ``run(state, rows, out) -> int``, both
-    module-level ``@njit(cache=True, nogil=True)`` functions of its module wrapped in ``staticmethod``, and
-    ``flush_kernel(state, out) -> int`` where ``latency`` is not 0, and builds ``self.state`` in
-    ``__init__``. ``kernel`` returns whether ``out`` was filled; ``run`` fills ``out[i]`` from ``rows[i]`` (a
-    row without a result is NaN throughout) and returns the number of results. Both give equal bits.
+    A subclass builds ``self.state`` (a NumPy structured array of shape (1,)) in ``start`` or ``__init__`` and
+    sets ``run``, a module-level compiled function wrapped in ``staticmethod``::
+
+        run(state, inputs, channels, t_ns, values, out_message, out_t_ns, out_values) -> int
+
+    with, for n messages, ``inputs`` (n,) indices into ``self.inputs``, ``channels`` (n,) indices into the
+    channels attached to that input, ``t_ns`` (n,) int64 and ``values`` (n, widest input) float64 (NaN beyond
+    the columns of a message's input). It writes result k as ``out_message[k]`` (the place in the block of the
+    message after which it is known, never decreasing), ``out_t_ns[k]`` and ``out_values[k]`` (all columns of all
+    outputs, one after another; NaN where an output has nothing to say), and returns the number of results. One
+    message may be answered with up to ``max_results`` rows. Blocks may be cut anywhere: the same bits come out.
+
+    ``run_end(state, out_t_ns, out_values) -> int`` gives what is held back at the end, up to ``max_held`` rows.
+    """
+
+    run: ClassVar[Callable[..., Any]]
+    run_end: ClassVar[Callable[..., Any] | None] = None
+    max_results: int = 1
+    max_held: int = 0
+    state: NDArray[Any]
+
+    def encode(self, index: int, channel: int, table: pl.DataFrame) -> FloatArray:
+        """Return the values of one channel's messages as the kernel takes them, shape (n, columns of the input).
+
+        Override it for texts (an address becomes the number of an anchor). A message is encoded by itself:
+        nothing may be kept from one to the next.
+        """
+        columns = self.columns_of(index, table)
+        out = np.empty((table.height, len(columns)))
+        for i, name in enumerate(columns):
+            out[:, i] = table[name].to_numpy()
+        return out
+
+    def columns_of(self, index: int, table: pl.DataFrame) -> tuple[str, ...]:
+        """Return the columns that input ``index`` reads of ``table``."""
+        wanted = self.inputs[index].columns
+        return tuple(c for c in table.columns if c not in TIMES) if wanted == ALL_COLUMNS else wanted
+
+    @cached_property
+    def width(self) -> int:
+        """Number of result columns."""
+        return len(output_columns(self))
+
+    def take(self, message: Message) -> Iterable[Result] | None:
+        """Take one message, return its results."""
+        import polars as pl
+
+        index = next(i for i, one in enumerate(self.inputs) if one.name == message.input)
+        columns = self.inputs[index].columns
+        if columns == ALL_COLUMNS:
+            columns = tuple(f"column_{i}" for i in range(len(message.values)))
+        table = pl.DataFrame({c: [v] for c, v in zip(columns, message.values, strict=True)})
+        values = self.encode(index, self.channel_index(index, message.channel), table)
+        at = np.zeros(self.max_results, np.int64), np.zeros(self.max_results, np.int64)
+        out = np.full((self.max_results, self.width), np.nan)
+        channels = np.array([self.channel_index(index, message.channel)])
+        count = self.run(
+            self.state, np.array([index]), channels, np.array([message.t_ns], np.int64), values, *at, out
+        )
+        return self.results(at[1][:count], out[:count])
+
+    def channel_index(self, index: int, topic: str) -> int:
+        """Return the place of ``topic`` among the channels attached to input ``index``."""
+        return self.topics.get(self.inputs[index].name, (topic,)).index(topic)
+
+    topics: Mapping[str, tuple[str, ...]] = {}
+    """Topics attached to each input, set by :meth:`start`; call it with ``super().start(context)``."""
+
+    def start(self, context: Context) -> None:
+        """Note which channels are attached."""
+        self.topics = {name: tuple(c.topic for c in attached) for name, attached in context.channels.items()}
+
+    def results(self, t_ns: IntArray, values: FloatArray) -> list[Result]:
+        """Return rows of the result vector as single results."""
+        found: list[Result] = []
+        for when, row in zip(t_ns.tolist(), values, strict=True):
+            first = 0
+            for output in self.outputs:
+                part = row[first : first + len(output.columns)]
+                first += len(output.columns)
+                if not (np.isnan(part[0]) if output.event else np.isnan(part).all()):
+                    found.append(Result(output.name, when, tuple(part.tolist())))
+        return found
+
+    def finish(self) -> Iterable[Result] | None:
+        """Return the results still held back."""
+        t_ns, values = self.held()
+        return self.results(t_ns, values)
+
+    def held(self) -> tuple[IntArray, FloatArray]:
+        """Return times (n,) and result vectors (n, width) still held back."""
+        t_ns, values = np.zeros(self.max_held, np.int64), np.full((self.max_held, self.width), np.nan)
+        count = (
+            int(self.run_end(self.state, t_ns, values)) if self.run_end is not None and self.max_held else 0
+        )
+        return t_ns[:count], values[:count]
+
+    def snapshot(self) -> Any:
+        """Return a copy of the packed state."""
+        return self.state.copy()
+
+    def restore(self, snapshot: Any) -> None:
+        """Go back to the state of ``snapshot``."""
+        self.state[:] = snapshot
+
+
+class RowEstimator(PlainEstimator):
+    """Base of estimators that take one row of numbers a sample of their first input.
+
+    The row
+        ``[dt_s, <columns of the first input>, <columns of every further input>]`` as float64. ``dt_s`` is the
+        time since the previous row, 0 for the first. Columns of the first input are always finite. Columns of
+        a further input carry its newest message that arrived since the previous row, NaN where none arrived:
+        a sampled view, causal, never interpolated. Messages that were overtaken by a newer one are counted.
+
+    The result
+        one float64 vector in the order of ``outputs`` (all columns of all outputs, one after another), or None
+        where there is nothing to say yet. With ``latency`` L, the result of call k speaks of row k − L; the
+        first L calls return None, and ``flush`` returns the last L results. A column that has no value is NaN.
+        An offline one has ``process(rows) -> results`` instead, called once with all rows.
+    """
+
+    def step(self, row: FloatArray) -> FloatArray | None:
+        """Take one row, return one result or None."""
+        raise NotImplementedError
+
+    def flush(self) -> FloatArray:
+        """Return the results of the last ``latency`` rows, shape (≤ latency, columns)."""
+        return np.empty((0, len(output_columns(self))))
+
+
+class RowKernel(RowEstimator):
+    """Base of row estimators whose step is a compiled kernel over one packed state.
+
+    A subclass sets ``kernel(state, row, out) -> bool`` and ``run(state, rows, out) -> int``, both module-level
+    compiled functions of its module wrapped in ``staticmethod``, and ``flush_kernel(state, out) -> int`` where
+    ``latency`` is not 0, and builds ``self.state`` in ``__init__``. ``kernel`` returns whether ``out`` was
+    filled; ``run`` fills ``out[i]`` from ``rows[i]`` (a row without a result is NaN throughout) and returns the
+    number of results. Both give equal bits.
     """
 
     kernel: ClassVar[Callable[..., Any]]
     run: ClassVar[Callable[..., Any]]
     flush_kernel: ClassVar[Callable[..., Any] | None] = None
-    state: FloatArray
+    state: NDArray[Any]
 
     def step(self, row: FloatArray) -> FloatArray | None:
         """Take one row, return one result or None."""
@@ -210,25 +506,24 @@ class KernelEstimator(PlainEstimator):
         """Number of result columns."""
         return len(output_columns(self))
 
-    def snapshot(self) -> FloatArray:
+    def snapshot(self) -> Any:
         """Return a copy of the packed state."""
         return self.state.copy()
 
-    def restore(self, snapshot: FloatArray) -> None:
+    def restore(self, snapshot: Any) -> None:
         """Go back to the state of ``snapshot``."""
         self.state[:] = snapshot
 
-    @classmethod
-    def make(cls, **params: Any) -> Self:
-        """Build from keyword parameters; see :func:`marcha.algorithms.make`."""
-        return cls(msgspec.convert(params, cls.Params))
+
+TIMES = ("t_ns", "t_log_ns")
+"""Columns of every table that are no values."""
 
 
-def input_columns(estimator: Estimator) -> tuple[str, ...]:
-    """Return the names of the row's entries: ``dt_s`` and every input's columns."""
+def input_columns(estimator: Any) -> tuple[str, ...]:
+    """Return the names of a row's entries: ``dt_s`` and every input's columns."""
     return ("dt_s", *(c for i in estimator.inputs for c in i.columns))
 
 
-def output_columns(estimator: Estimator) -> tuple[str, ...]:
-    """Return the names of the result's entries, ``<output>.<column>``."""
+def output_columns(estimator: Any) -> tuple[str, ...]:
+    """Return the names of a result vector's entries, ``<output>.<column>``."""
     return tuple(f"{o.name}.{c}" for o in estimator.outputs for c in o.columns)

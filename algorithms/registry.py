@@ -114,8 +114,11 @@ def _points(scan: Callable[..., Any], path: tuple[str, ...]) -> tuple[EntryPoint
 def _load(point: Any) -> type[PlainEstimator] | None:
     try:
         cls = point.load()
-        if not (isinstance(cls, type) and callable(getattr(cls, "step", None))):
-            raise TypeError(f"{cls!r} is not a class with a method step")
+        if not (
+            isinstance(cls, type)
+            and (callable(getattr(cls, "take", None)) or callable(getattr(cls, "step", None)))
+        ):
+            raise TypeError(f"{cls!r} is not a class with a method take or step")
     except Exception as error:
         warnings.warn(
             f"estimator plug-in {point.name!r} ({point.value}) cannot be loaded: {error}", stacklevel=3

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..algorithms.contract import (
     FloatArray,
-    KernelEstimator,
+    RowKernel,
     input_columns,
     output_columns,
 )
@@ -290,7 +290,7 @@ class Runner:
 
 def warm_up(estimator: Any, blocks: bool) -> None:
     """Let a kernel compile (or load from its cache) before a clock runs; its state stays as it is."""
-    if not isinstance(estimator, KernelEstimator):
+    if not isinstance(estimator, RowKernel):
         return
     before = estimator.snapshot()
     zeros = np.zeros((2, len(input_columns(estimator))))

@@ -81,7 +81,7 @@ class Echo(PlainEstimator):
 
     def __init__(self, columns: Sequence[str] = ACC, further: Sequence[Input] = ()) -> None:
         super().__init__()
-        self.inputs = (Input(IMU, tuple(columns)), *further)
+        self.inputs = (Input("imu", IMU, tuple(columns)), *further)
         names = ("dt_s", *columns, *(c for i in further for c in i.columns))
         self.outputs = (Output("row", VALUES, names),)
 
@@ -97,7 +97,7 @@ class Smoother(PlainEstimator):
     def __init__(self, latency: int = 0) -> None:
         super().__init__()
         self.latency = latency
-        self.inputs = (Input(IMU, ACC),)
+        self.inputs = (Input("imu", IMU, ACC),)
         self.outputs = (
             Output("state", VALUES, ("x", "y", "z")),
             Output("peak", VALUES, ("value", "dt"), event=True),

@@ -127,7 +127,7 @@ class StandsWhilePositive(PlainEstimator):
     """Still where the first value is positive."""
 
     name = "stands"
-    inputs = (Input(IMU, ("acc_x",)),)
+    inputs = (Input("imu", IMU, ("acc_x",)),)
     outputs = (Output("stance", "marcha_msgs/msg/Stance", ("still",)),)
 
     def step(self, row: np.ndarray) -> np.ndarray:
@@ -307,7 +307,7 @@ class Centred(PlainEstimator):
 
     name = "centred"
     offline = True
-    inputs = (Input(IMU, ACC),)
+    inputs = (Input("imu", IMU, ACC),)
     outputs = (Output("acc", VALUES, ACC),)
 
     def process(self, rows: np.ndarray) -> np.ndarray:
@@ -348,7 +348,7 @@ class Bare:
     """The least that the protocol asks: no base class, no snapshot, no latency."""
 
     name = "bare"
-    inputs = (Input(IMU, ACC),)
+    inputs = (Input("imu", IMU, ACC),)
     outputs = (Output("sum", VALUES, ("total",)),)
 
     def __init__(self) -> None:

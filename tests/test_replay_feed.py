@@ -48,7 +48,9 @@ def test_rows_equal_a_plain_event_loop(
 ) -> None:
     pairs = [(IMU_CHANNEL, imu), (MAG_CHANNEL, mag)]
     source = MemorySource(pairs[::-1] if mag_first else pairs, max_rows)
-    result, tables = run_all(source, [Echo(further=[Input(MAG, MAG_COLUMNS)])], gap=GapPolicy(max_gap_s=1.0))
+    result, tables = run_all(
+        source, [Echo(further=[Input("mag", MAG, MAG_COLUMNS)])], gap=GapPolicy(max_gap_s=1.0)
+    )
     columns = {"/foot/imu": ACC, "/foot/mag": MAG_COLUMNS}
     expected, counts = oracle_rows(source.tables, columns, "/foot/imu")
     got = echoed(tables)
@@ -61,7 +63,7 @@ def test_rows_equal_a_plain_event_loop(
 def test_ties_go_by_channel_order() -> None:
     imu = table([0, STEP_NS], {c: [1.0, 1.0] for c in ACC})
     mag = table([STEP_NS], {c: [7.0] for c in MAG_COLUMNS})
-    echo = Echo(further=[Input(MAG, MAG_COLUMNS)])
+    echo = Echo(further=[Input("mag", MAG, MAG_COLUMNS)])
     _, before = run_all(MemorySource([(MAG_CHANNEL, mag), (IMU_CHANNEL, imu)]), [echo])
     _, after = run_all(MemorySource([(IMU_CHANNEL, imu), (MAG_CHANNEL, mag)]), [echo])
     assert echoed(before)[1][2][-1] == 7.0
@@ -80,7 +82,8 @@ def test_the_message_is_joined_once_it_is_known_not_when_it_was_measured() -> No
     imu = table([0, STEP_NS, 2 * STEP_NS], {c: [1.0] * 3 for c in ACC})
     late = table([0], {c: [7.0] for c in MAG_COLUMNS}, t_log_ns=[STEP_NS + 1])
     _, result = run_all(
-        MemorySource([(IMU_CHANNEL, imu), (MAG_CHANNEL, late)]), [Echo(further=[Input(MAG, MAG_COLUMNS)])]
+        MemorySource([(IMU_CHANNEL, imu), (MAG_CHANNEL, late)]),
+        [Echo(further=[Input("mag", MAG, MAG_COLUMNS)])],
     )
     column = [row[-1] for _, _, row in echoed(result)]
     assert np.isnan(column[0])

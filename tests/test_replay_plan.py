@@ -84,7 +84,7 @@ class Tunable(PlainEstimator):
         rate_hz: float = 0.0
 
     name = "tunable"
-    inputs = (Input(IMU, ACC),)
+    inputs = (Input("imu", IMU, ACC),)
     outputs = (Output("v", VALUES, ("v",)),)
 
     def step(self, row: np.ndarray) -> np.ndarray:
@@ -163,8 +163,8 @@ def test_a_missing_gyroscope_is_named() -> None:
         plan_runs(two_imus(), [Echo(columns=(*ACC, *GYR))])
 
 
-WITH_MAG = Echo(further=[Input(MAG, MAG_COLUMNS, optional=True)])
-NEEDS_MAG = Echo(further=[Input(MAG, MAG_COLUMNS)])
+WITH_MAG = Echo(further=[Input("mag", MAG, MAG_COLUMNS, optional=True)])
+NEEDS_MAG = Echo(further=[Input("mag", MAG, MAG_COLUMNS)])
 
 
 def test_a_further_input_is_the_one_beside_the_first() -> None:
@@ -209,7 +209,7 @@ class Pair(Echo):
 
     def __init__(self) -> None:
         super().__init__()
-        self.inputs = (Input(IMU, ACC), Input(IMU, ACC))
+        self.inputs = (Input("a", IMU, ACC), Input("b", IMU, ACC))
         self.outputs = (Output("d", VALUES, ("d",)),)
 
 

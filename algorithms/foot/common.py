@@ -15,11 +15,12 @@ import numpy as np
 
 from ..contract import (
     AlgorithmError,
+    Annotate,
     FloatArray,
     Input,
-    KernelEstimator,
     Output,
     Remark,
+    RowKernel,
 )
 from ..numerics.compiled import compiled, inlined
 from ..numerics.rotations import quat_from_rot
@@ -76,9 +77,11 @@ from .layout import (
 )
 
 IMU_COLUMNS = ("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z")
-IMU = Input("sensor_msgs/msg/Imu", IMU_COLUMNS)
-MAGNETIC_FIELD = Input("sensor_msgs/msg/MagneticField", ("mag_x", "mag_y", "mag_z"), optional=True)
-FLUID_PRESSURE = Input("sensor_msgs/msg/FluidPressure", ("pressure_pa",), optional=True)
+IMU = Input("imu", "sensor_msgs/msg/Imu", IMU_COLUMNS, regular=True)
+MAGNETIC_FIELD = Input(
+    "magnetometer", "sensor_msgs/msg/MagneticField", ("mag_x", "mag_y", "mag_z"), optional=True
+)
+FLUID_PRESSURE = Input("barometer", "sensor_msgs/msg/FluidPressure", ("pressure_pa",), optional=True)
 SOURCE_RATE_HZ = 100.0
 """Sample rate of the source's device, for a bare ``make()``; a different measured rate is remarked."""
 
@@ -384,7 +387,7 @@ SIGMA = Output(
 )
 
 
-class FootEstimator(KernelEstimator):
+class FootEstimator(RowKernel):
     """Base of the foot estimators: builds the packed state, names the outputs, makes the remarks.
 
     A subclass sets ``kernel``, ``run``, ``flush_kernel``, ``state_size`` (end of its own numbers in the
@@ -420,12 +423,19 @@ class FootEstimator(KernelEstimator):
                 ("pos_x", "pos_y", "pos_z", "quat_w", "quat_x", "quat_y", "quat_z"),
             ),
             Output("velocity", "geometry_msgs/msg/Vector3Stamped", ("vel_x", "vel_y", "vel_z")),
-            Output("stance", "marcha_msgs/msg/Stance", ("still",)),
+            Output(
+                "stance",
+                "marcha_msgs/msg/Stance",
+                ("still",),
+                frame="imu",
+                annotate=Annotate("stance", "state", "still", "stance"),
+            ),
             Output(
                 "step",
                 "marcha_msgs/msg/Step",
                 ("swing_s", "index", "length_m", "height_m", "heading_rad"),
                 event=True,
+                annotate=Annotate("step", "interval", label="step {index}"),
             ),
             *((SIGMA,) if self.has_sigma else ()),
             Output(
@@ -433,6 +443,7 @@ class FootEstimator(KernelEstimator):
                 "marcha_msgs/msg/NamedValues",
                 detectors.STATISTICS[p.detector],
                 metadata=(("detector", p.detector), *thresholds(p)),
+                frame="imu",
             ),
         )
         self.configure(p)

@@ -31,7 +31,7 @@ def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
 
 @compiled
 def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
-    """Take all rows; see :class:`.contract.KernelEstimator`."""
+    """Take all rows; see :class:`..contract.RowKernel`."""
     results = 0
     for i in range(rows.shape[0]):
         if kernel(state, rows[i], out[i]):
