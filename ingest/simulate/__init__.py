@@ -6,6 +6,7 @@ give equal bytes.
 """
 
 from .gait import Mount, Style
+from .leg import LegCapture, LegOptions, leg
 from .scenarios import SCENARIOS
 from .sensors import IDEAL, ImuErrors
 from .walks import (
@@ -20,6 +21,8 @@ __all__ = [
     "IDEAL",
     "SCENARIOS",
     "ImuErrors",
+    "LegCapture",
+    "LegOptions",
     "Line",
     "Mount",
     "Options",
@@ -27,6 +30,7 @@ __all__ = [
     "Simulation",
     "Style",
     "Walk",
+    "leg",
     "simulate",
     "walk",
 ]

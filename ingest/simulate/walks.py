@@ -152,7 +152,7 @@ def make_options(scenario: str, given: dict[str, Any]) -> Options:
     parts: dict[str, dict[str, Any]] = {"style": {}, "imu1": {}, "imu2": {}, "mount1": {}, "mount2": {}}
     for name, raw in given.items():
         head, _, tail = name.partition(".")
-        value = _plain(raw)
+        value = plain(raw)
         if tail and head in parts:
             parts[head][tail] = value
         elif name in parts:
@@ -199,7 +199,7 @@ def checked(scenario: str, kind: type[T], values: dict[str, Any], prefix: str = 
         raise UsageError(f"simulate {scenario}: option {prefix}{name}={value!r}: {said}") from None
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Return a structure or NumPy value as built-in types, and "0.1,0,0" as a list."""
     if isinstance(value, str):
         return value.split(",") if "," in value else value
