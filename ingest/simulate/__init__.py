@@ -1,12 +1,14 @@
 """Simulated walks with known truth, written as the raw logs of a real device.
 
 :func:`simulate` writes the serial text or binary packets of a shoe-mounted box with two MPU-6050, and the
-truth beside it; :func:`walk` gives the same walk as arrays, without files. Equal scenario, seed and options
-give equal bytes.
+truth beside it; :func:`walk` gives the same walk as arrays, without files. :func:`phone_walk` gives a phone
+that is carried in one of six placements. Equal scenario, seed and options give equal bytes.
 """
 
 from .gait import Mount, Style
 from .leg import LegCapture, LegOptions, leg
+from .phone import PhoneOptions, PhoneWalk, phone_walk
+from .phone_routes import PHONE_SCENARIOS
 from .scenarios import SCENARIOS
 from .sensors import IDEAL, ImuErrors
 from .walks import (
@@ -19,6 +21,7 @@ from .writer import Line, Simulated, simulate
 
 __all__ = [
     "IDEAL",
+    "PHONE_SCENARIOS",
     "SCENARIOS",
     "ImuErrors",
     "LegCapture",
@@ -26,11 +29,14 @@ __all__ = [
     "Line",
     "Mount",
     "Options",
+    "PhoneOptions",
+    "PhoneWalk",
     "Simulated",
     "Simulation",
     "Style",
     "Walk",
     "leg",
+    "phone_walk",
     "simulate",
     "walk",
 ]
