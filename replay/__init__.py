@@ -3,7 +3,7 @@
 from .alignment import ALIGNMENTS, align
 from .api import replay
 from .attachment import NOT_RAW, Attachment
-from .calibrations import load_calibration, save_calibration
+from .calibrations import calibrate, load_calibration, save_calibration
 from .clock import Clock, ManualClock, SystemClock
 from .engine import Engine, ReplayResult, Run
 from .evaluate import (
@@ -61,6 +61,7 @@ __all__ = [
     "Truth",
     "Tuned",
     "align",
+    "calibrate",
     "check_thresholds",
     "evaluate",
     "load_calibration",
