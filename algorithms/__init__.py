@@ -21,11 +21,10 @@ from .contract import (
     output_columns,
 )
 from .parameters import Parameter, describe
-from .registry import CALIBRATIONS, available, build_params, find, make
+from .registry import available, find, make
 
 __all__ = [
     "ALL_COLUMNS",
-    "CALIBRATIONS",
     "AlgorithmError",
     "Annotate",
     "Calibration",
@@ -45,7 +44,6 @@ __all__ = [
     "RowKernel",
     "Stretch",
     "available",
-    "build_params",
     "describe",
     "find",
     "input_columns",

@@ -2,8 +2,6 @@
 
 from .alignment import ALIGNMENTS, align
 from .api import replay
-from .attachment import NOT_RAW, Attachment
-from .calibrations import calibrate, load_calibration, save_calibration
 from .clock import Clock, ManualClock, SystemClock
 from .engine import Engine, ReplayResult, Run
 from .evaluate import (
@@ -12,7 +10,7 @@ from .evaluate import (
     check_thresholds,
     evaluate,
 )
-from .gaps import GapPolicy
+from .feed import GapPolicy
 from .metrics import RunView, Truth, nees_bounds
 from .plan import (
     EstimatorSpec,
@@ -34,8 +32,6 @@ from .tuning import Tuned, tune
 
 __all__ = [
     "ALIGNMENTS",
-    "NOT_RAW",
-    "Attachment",
     "Batch",
     "Clock",
     "Engine",
@@ -61,14 +57,11 @@ __all__ = [
     "Truth",
     "Tuned",
     "align",
-    "calibrate",
     "check_thresholds",
     "evaluate",
-    "load_calibration",
     "nees_bounds",
     "parse_estimator",
     "plan_runs",
     "replay",
-    "save_calibration",
     "tune",
 ]

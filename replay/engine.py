@@ -9,22 +9,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import msgspec
 import numpy as np
 import polars as pl
 
 from ..recording.errors import Finding, UsageError
 from ..recording.provenance import environment
 from ..recording.threads import Ahead
-from .blocks import Block, joined_by_name
-from .calibrations import corrections
+from .blocks import Block
 from .clock import Clock, SystemClock
-from .gaps import GapPolicy, Gaps, policy_of
-from .merging import LEVELS, Merged, Part
-from .messages import MessageFeed
+from .feed import Feed, GapPolicy, Merged
 from .plan import Plan, PlannedRun
-from .rows import RowFeed
-from .runs import Runner, runner_of
+from .runs import Runner
 from .sinks import RecordingSink, Sink
 from .sources import Batch, Source
 
@@ -45,8 +40,8 @@ class Run:
         Id.
     estimator, version, input : str
         Name, distribution and version, topic of the first input.
-    inputs : dict of str to tuple of str
-        Topics by the name of the input.
+    inputs : tuple of (str or None)
+        Topics of all inputs.
     params : dict
         Every parameter.
     samples : int
@@ -77,7 +72,7 @@ class Run:
     estimator: str
     version: str
     input: str
-    inputs: dict[str, tuple[str, ...]]
+    inputs: tuple[str | None, ...]
     params: dict[str, Any]
     samples: int
     loop_s: float
@@ -160,7 +155,7 @@ class Engine:
         sinks: Sequence[Sink] = (),
         mode: Literal["block", "sample"] = "block",
         speed: float | str = "max",
-        gap: Gaps | None = None,
+        gap: GapPolicy | None = None,
         clock: Clock | None = None,
         start_ns: int | None = None,
         end_ns: int | None = None,
@@ -183,24 +178,15 @@ class Engine:
         self._progress = progress
         self._paused = threading.Event()
 
-        feeds: dict[Any, RowFeed | MessageFeed] = {}
+        feeds: dict[Any, Feed] = {}
         self.runners: list[Runner] = []
         for run in runs:
-            if (key := (run.takes_rows, run.inputs)) not in feeds:
-                feeds[key] = (
-                    RowFeed(run.row_inputs, policy_of(self.gap, run.inputs[0].input), run.rate_hz)
-                    if run.takes_rows
-                    else MessageFeed(run.inputs, self.gap)
-                )
-            self.runners.append(runner_of(run, feeds[key], blocks=mode == "block"))
+            feed = feeds.setdefault(run.inputs, Feed(run.inputs, self.gap, run.rate_hz))
+            self.runners.append(Runner(run, feed, blocks=mode == "block"))
         self._feeds = list(feeds.values())
-        served = {c.topic for r in runs for c in r.inputs}
-        self._read_by_runs = {c.topic for r in runs for c in r.outputs.values() if c.topic in served}
-        given = {(c.kind, c.subject): c for r in runs for c in r.calibrations}
-        self._corrections, self._corrected = corrections(list(given.values()), source.channels)
 
-        raw = any(s.raw for s in self.sinks)
-        read = served
+        raw = any(getattr(s, "raw", True) for s in self.sinks)
+        read = {t for f in self._feeds for t, _ in f.inputs if t is not None}
         self._topics = [t for t in source.channels if raw or t in read]
         self._raw_topics = set(source.channels) if raw else set()
         estimates = {c.topic: c for r in runs for c in r.outputs.values()}
@@ -306,7 +292,8 @@ class Engine:
         """
         self._stop_reading()
         end_ns = max(self._newest_ns, self.source.end_ns if self._end_ns is None else self._newest_ns)
-        self._drive(Part({}, {}), end_ns)
+        for runner in self.runners:
+            self._emit_all(runner, runner.finish(end_ns))
         output = next((s.path for s in self.sinks if isinstance(s, RecordingSink)), None)
         result = ReplayResult(output, [self._result(r) for r in self.runners])
         if complete is not None:
@@ -397,9 +384,11 @@ class Engine:
         for topic, table in part.tables.items():
             if topic in self._raw_topics:
                 self._emit(topic, Block(table), raw=True)
-            if topic in self._corrections:
-                part.tables[topic] = self._corrections[topic](table)
-        self._drive(part)
+        rows = {id(f): f.take(part) for f in self._feeds}
+        for runner in self.runners:
+            ready = rows[id(runner.feed)]
+            if len(ready):
+                self._emit_all(runner, runner.take(ready))
         self._cursor = last
         self._newest_ns = max(self._newest_ns, int(merged.log_ns[last - 1]))
         whole = last == len(merged)
@@ -413,26 +402,9 @@ class Engine:
             begin, end = self._begin_ns, self._end_ns if self._end_ns is not None else self.source.end_ns
             self._progress(min(newest, end) - begin if end > begin else newest, max(0, end - begin))
 
-    def _drive(self, part: Part, end_ns: int | None = None) -> None:
-        """Take the messages of a part through all runs, each behind those whose outputs it reads.
-
-        ``end_ns``: these are the last ones; estimators give what they hold.
-        """
-        given: dict[int, Any] = {}
-        for level, runner in enumerate(self.runners, 1):
-            feed = runner.feed
-            if id(feed) not in given:
-                given[id(feed)] = feed.take(part)
-            ready = given[id(feed)]
-            blocks = runner.take(ready) if len(ready) else {}
-            if end_ns is not None:
-                blocks = joined_by_name([blocks, runner.finish(end_ns)])
-            for name, block in blocks.items():
-                topic = runner.plan.outputs[name].topic
-                self._emit(topic, block)
-                if topic in self._read_by_runs:
-                    assert block.keys is not None
-                    part.add(topic, block.table, block.keys // LEVELS * LEVELS + level)
+    def _emit_all(self, runner: Runner, blocks: dict[str, Block]) -> None:
+        for name, block in blocks.items():
+            self._emit(runner.plan.outputs[name].topic, block)
 
     def _emit(self, topic: str, block: Block, raw: bool = False) -> None:
         before = self._written.get(topic, 0)
@@ -440,11 +412,16 @@ class Engine:
         known = self._seen.get(topic, 0)
         self._seen[topic] = max(known, after)
         for sink in self.sinks:
-            if raw and not sink.raw:
+            if raw and not getattr(sink, "raw", True):
                 continue
-            fresh = block if sink.rewinds else block.since(max(0, known - before))
-            if len(fresh):
-                sink.write_block(topic, fresh)
+            fresh = block if hasattr(sink, "rewind") else block.since(max(0, known - before))
+            if not len(fresh):
+                continue
+            write_block = getattr(sink, "write_block", None)
+            if write_block is not None:
+                write_block(topic, fresh)
+            else:
+                sink.write(topic, fresh.table)
 
     # -- going back ----------------------------------------------------------------------------------
 
@@ -466,7 +443,9 @@ class Engine:
         self._position_ns = checkpoint.log_ns
         self._merged, self._cursor, self._exhausted = None, 0, False
         for sink in self.sinks:
-            sink.rewind(checkpoint.log_ns)
+            rewind = getattr(sink, "rewind", None)
+            if rewind is not None:
+                rewind(checkpoint.log_ns)
 
     def _stop_reading(self) -> None:
         close = getattr(self._batches, "close", None)
@@ -480,8 +459,7 @@ class Engine:
         plan, feed = runner.plan, runner.feed
         findings, fatal = runner.findings()
         outputs = {name: c.topic for name, c in plan.outputs.items()}
-        gap = policy_of(self.gap, plan.inputs[0].input)
-        findings = [*findings, *self._corrected] if self._corrected else findings
+        inputs = tuple(t for t, _ in plan.inputs)
         lineage = {
             "run": plan.run,
             "estimator": plan.name,
@@ -489,7 +467,7 @@ class Engine:
             "environment": environment(),
             "source": str(getattr(plan.estimator, "source", "")),
             "input": plan.input,
-            "inputs": json.dumps(plan.topics),
+            "inputs": json.dumps(inputs),
             "params": json.dumps(plan.params),
             **{f"param.{k}": v if isinstance(v, str) else json.dumps(v) for k, v in plan.params.items()},
             "outputs": json.dumps(outputs),
@@ -497,13 +475,12 @@ class Engine:
             "offline": json.dumps(plan.offline),
             "rate_hz": f"{plan.rate_hz:.6g}",
             "mode": self.mode,
-            "gap.policy": gap.policy,
-            "gap.max_gap_s": f"{gap.limit_s(plan.rate_hz):g}",
+            "gap.policy": self.gap.policy,
+            "gap.max_gap_s": f"{feed.limit_s:g}",
             "range.start_ns": "" if self._start_ns is None else str(self._start_ns),
             "range.end_ns": "" if self._end_ns is None else str(self._end_ns),
             "samples": str(runner.samples),
-            "segments": str(1 + feed.restarts),
-            **{f"calibration.{c.kind}": msgspec.json.encode(c).decode() for c in plan.calibrations},
+            "segments": str(feed.segments),
             "loop_s": f"{runner.loop_s:.6f}",
             "fatal": json.dumps(fatal),
             "findings": json.dumps([[f.kind, f.count, f.detail] for f in findings]),
@@ -513,15 +490,15 @@ class Engine:
             plan.name,
             plan.version,
             plan.input,
-            plan.topics,
+            inputs,
             plan.params,
             runner.samples,
             runner.loop_s,
-            1 + feed.restarts,
+            feed.segments,
             outputs,
             findings,
             fatal,
-            annotations=runner.annotations(),
+            annotations=runner.annotation_table(),
             lineage=lineage,
         )
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from marcha.algorithms import Input, Output, RowEstimator
+from marcha.algorithms import Input, Output, PlainEstimator
 from marcha.replay import Batch, Engine, PlannedChannel, ReplayResult, TableSink, plan_runs
 
 IMU = "sensor_msgs/msg/Imu"
@@ -40,9 +40,6 @@ class MemorySource:
 
     seekable = True
     name = "memory"
-    metadata: Mapping[str, Mapping[str, str]] = {}
-    attachments: Mapping[str, bytes] = {}
-    static: Mapping[str, pl.DataFrame] = {}
 
     def __init__(self, pairs: Sequence[tuple[PlannedChannel, pl.DataFrame]], max_rows: int = 1000) -> None:
         self.channels = {c.topic: c for c, _ in pairs}
@@ -77,7 +74,7 @@ class MemorySource:
                 yield Batch(b, part)
 
 
-class Echo(RowEstimator):
+class Echo(PlainEstimator):
     """Says exactly what it was fed."""
 
     name = "echo"
@@ -92,7 +89,7 @@ class Echo(RowEstimator):
         return row.copy()
 
 
-class Smoother(RowEstimator):
+class Smoother(PlainEstimator):
     """Recursive: its bits depend on every row and their order. Late by ``latency`` rows; takes blocks too."""
 
     name = "smoother"

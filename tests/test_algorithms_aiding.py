@@ -13,14 +13,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from marcha.algorithms import AlgorithmError, make
-from marcha.algorithms.foot import aiding, iez9, strapdown
-from marcha.algorithms.foot import common as foot
-from marcha.algorithms.foot import layout as la
+from marcha.algorithms.foot import core, iez9
+from marcha.algorithms.foot.aiding import stance, straight
+from marcha.algorithms.numerics import strapdown
 from scipy.spatial.transform import Rotation
 
 from . import algorithms_reference as ref
 from .algorithms_support import columns, run, simulated
-from .contracts.estimator import RowEstimatorContract
+from .contracts.estimator import EstimatorContract
 
 AIDED = ("foot.9iez", "foot.15iez-zaru")
 FIELD_N = np.array([22e-6, 5e-6, -40e-6])
@@ -95,7 +95,7 @@ def same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
 # ---------------------------------------------------------------------------------------------
 
 
-class AidedContract(RowEstimatorContract):
+class AidedContract(EstimatorContract):
     params = ALL | {"init_s": 0.5}
 
     def rows(self) -> np.ndarray:
@@ -141,8 +141,8 @@ def test_interpreted_gives_the_same_state_to_the_bit(tmp_path: Path) -> None:
     for name in AIDED:
         estimator: Any = make(name, **ALL, init_s=0.5)
         estimator.run_block(rows, np.empty((len(rows), estimator.width)))
-        for counter in (aiding.HUPT_USED, aiding.HEADING_USED, aiding.MAG_USED, aiding.BARO_USED):
-            assert estimator.state[counter] > 0
+        aids = estimator.record.aids
+        assert min(a.used for a in (aids.height, aids.straight, aids.magnetometer, aids.barometer)) > 0
         wanted.append(estimator.state)
     assert np.load(tmp_path / "state.npy").tobytes() == np.concatenate(wanted).tobytes()
 
@@ -151,25 +151,27 @@ def test_without_aids_the_filter_is_the_sources_to_the_bit() -> None:
     """The same kernels in the source's order, no aid among them."""
     rows = simulated()[0][:1200]
     got, plain = run("foot.9iez", rows)[0], make("foot.9iez")
-    s, out = plain.state, np.empty(plain.width)  # type: ignore[attr-defined]
+    (s,), ring = plain._views  # type: ignore[attr-defined]
+    out = np.empty(plain.width)  # type: ignore[attr-defined]
     result = []
 
     def navigate() -> None:
-        r = foot.release(s)
-        if not foot.starts(s) and s[la.STARTED] > 0.5:
+        r = ring[s["released"] & (len(ring) - 1)]
+        core.release(s, ring)
+        if not core.starts(s) and s["started"]:
             strapdown.advance(s, r)
-            iez9.predict(s, s[r + la.R_DT])
-            if s[r + la.R_STILL] > 0.5:
+            iez9.predict(s, r["dt"])
+            if r["still"]:
                 iez9.zero_velocity(s, 0)
-        foot.emit(s, r, out)
-        foot.emit_sigma(s, iez9.P, iez9.N, iez9.XPOS, iez9.XVEL, iez9.ATT, out)
-        foot.emit_detector(s, r, iez9.FIRST_DETECTOR, out)
+        core.emit(s, r, out)
+        core.emit_sigma(s, iez9.POS, iez9.VEL, iez9.ATT, out)
+        core.emit_detector(r, core.AFTER_SIGMA, out)
         result.append(out.copy())
 
     for row in rows:
-        if foot.take(s, row):
+        if core.take(s, ring, row):
             navigate()
-    while foot.take_end(s):
+    while core.take_end(s, ring):
         navigate()
     assert np.array(result).tobytes() == np.column_stack(list(got.values())).tobytes()
 
@@ -316,7 +318,7 @@ def test_every_aid_equals_plain_matrices(aids: str) -> None:
     }
     deaf = {sigma: 1e9 for aid, sigma in noise.items() if aids not in (aid, "all")}
     result, estimator = run("foot.9iez", rows, **ALL | deaf)
-    first = int(estimator.state[la.INIT_INDEX])
+    first = int(estimator.record.rest.index)
     wanted = plain_aided(rows, result["stance.still"] > 0.5, first, estimator.params)
     got = np.hstack([columns(result, o) for o in ("pose", "velocity", "sigma")])[:, [0, 1, 2, *range(7, 19)]]
     np.testing.assert_allclose(got[first:], wanted, rtol=0, atol=1e-8)
@@ -328,7 +330,7 @@ def test_every_aid_equals_plain_matrices(aids: str) -> None:
     angle=st.floats(-50.0, 50.0),
 )
 def test_angles_are_wrapped(angle: float) -> None:
-    wrapped = aiding.wrap(angle)
+    wrapped = straight.wrap(angle)
     assert abs(wrapped) <= np.pi + 1e-12
     assert abs(np.exp(1j * wrapped) - np.exp(1j * angle)) < 1e-12
 
@@ -337,7 +339,7 @@ def test_angles_are_wrapped(angle: float) -> None:
 def test_the_barometric_height_is_the_standard_atmospheres(height: float) -> None:
     """ISO 2533 at sea level: p = 101325 Pa (1 − 2.25577e-5 h)^5.25588, its usual printed constants."""
     pressure = 101_325.0 * (1.0 - 2.25577e-5 * height) ** 5.25588
-    got = aiding.pressure_height(pressure, 101_325.0, 288.15 / 0.0065)
+    got = stance.pressure_height(pressure, 101_325.0, 288.15 / 0.0065)
     assert abs(got - height) < 1e-4 * abs(height) + 1e-6
 
 
@@ -459,7 +461,7 @@ def test_the_magnetometer_corrects_the_heading(name: str, scenario: str) -> None
 def test_without_field_in_the_rest_the_first_stance_with_one_counts() -> None:
     rows, walk = drifting("rectangle", laps=4)
     on, estimator = run("foot.15iez-zaru", with_field(rows, walk, first=500), magnetometer=True)
-    assert estimator.state[aiding.MAG_USED] > 40
+    assert estimator.record.aids.magnetometer.used > 40
     assert heading_error(on, walk) < 0.6 * heading_error(run("foot.15iez-zaru", rows)[0], walk)
 
 
@@ -471,7 +473,7 @@ def test_a_disturbed_field_is_refused(gate: str) -> None:
     off = run("foot.9iez", rows)[0]
     on, estimator = run("foot.9iez", field, magnetometer=True)
     assert same(off, on)
-    assert estimator.state[aiding.MAG_REFUSED] > 10
+    assert estimator.record.aids.magnetometer.refused > 10
     assert [r.kind for r in estimator.remarks()] == ["aid_unused"]
     assert "refused" in estimator.remarks()[0].detail
 
@@ -488,7 +490,7 @@ def test_the_barometer_corrects_the_height(name: str, first: int) -> None:
     on, estimator = run(name, with_pressure(rows, walk, first=first), barometer=True)
     assert off[-1] > 0.6
     assert abs(heights(on, walk)[-1]) < 0.72 * off[-1]
-    assert estimator.state[aiding.BARO_USED] > 50
+    assert estimator.record.aids.barometer.used > 50
 
 
 def test_the_barometer_follows_stairs_beside_the_flat_ground() -> None:

@@ -9,10 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from marcha.algorithms import make
-from marcha.algorithms.foot.detectors import CLEANINGS, KINDS, STATISTICS
+from marcha.algorithms.foot.detectors import BY_NAME
+from marcha.algorithms.foot.detectors.cleaning import CLEANINGS
 
 from .algorithms_support import columns, rows_of, run, simulated
 
+KINDS = ("c1c2c3", "pitch", "shoe", "are", "mv", "mag")
 LIMITS = {
     "pitch": {"pitch_dev": 6.0, "pitch_var": 6.0},
     "shoe": {"shoe": 0.3e5},
@@ -143,7 +145,7 @@ def test_statistics_equal_the_offline_ones(kind: str, side: str, source: str) ->
     ref = np.degrees(np.arctan2(-mean[0], np.hypot(mean[1], mean[2])))
     wanted = offline(rows, kind, WINDOW.get(kind, 5), side, pitch, ref)
     got = columns(result, "detector")
-    assert got.shape[1] == len(STATISTICS[kind])
+    assert got.shape[1] == len(BY_NAME[kind].statistics)
     if kind == "pitch":  # carried by sines of the mechanization: same to rounding
         np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-9, equal_nan=True)
     else:

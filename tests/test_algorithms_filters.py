@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from marcha.algorithms import make
-from marcha.algorithms.foot import iez9 as foot_9iez
 from marcha.algorithms.foot import iez9_mad as foot_9iez_mad
 from marcha.algorithms.foot import iez15_zaru as foot_15iez_zaru
-from marcha.algorithms.foot import layout as la
 from marcha.algorithms.numerics import kalman, rotations
+from marcha.algorithms.numerics.records import attributes, record_type
 from scipy.spatial.transform import Rotation
 
 from . import algorithms_reference as ref
@@ -53,7 +52,7 @@ def compare(result: dict[str, np.ndarray], wanted: np.ndarray, first: int, toler
 def test_nine_states_equal_the_plain_filter() -> None:
     rows, _ = long_walk()
     result, estimator = run("foot.9iez", rows)
-    first = int(estimator.state[la.INIT_INDEX])
+    first = int(estimator.record.rest.index)
     compare(result, ref.filter9(rows, result["stance.still"] > 0.5, first), first, 1e-9)
 
 
@@ -61,7 +60,7 @@ def test_fifteen_states_equal_the_plain_filter() -> None:
     rows, _ = long_walk()
     result, estimator = run("foot.15iez-zaru", rows)
     p = estimator.params
-    first = int(estimator.state[la.INIT_INDEX])
+    first = int(estimator.record.rest.index)
     wanted = ref.filter15(
         rows,
         result["stance.still"] > 0.5,
@@ -128,12 +127,10 @@ def test_kernel_prediction_is_the_matrix_product(force: tuple, turn: tuple, dt: 
     cov = root @ root.T
     c = Rotation.from_rotvec(turn).as_matrix()
     f = np.array(force) * 10
-    s = make("foot.15iez-zaru").state.copy()  # type: ignore[attr-defined]
-    s[la.ROT : la.ROT + 9] = c.ravel()
-    s[la.ACC_N : la.ACC_N + 3] = f
-    s[foot_15iez_zaru.P : foot_15iez_zaru.P + 225] = cov.ravel()
+    s = make("foot.15iez-zaru").record  # type: ignore[attr-defined]
+    s.rot[:], s.force[:], s.P[:] = c, f, cov
     foot_15iez_zaru.predict(s, dt)
-    got = s[foot_15iez_zaru.P : foot_15iez_zaru.P + 225].reshape(15, 15)
+    got = s.P
     phi = ref.transition15(f, c, dt)
     q = [0.01**2 * dt**2] * 3 + [1e-6**2 * dt] * 3 + [0] * 3 + [0.1**2 * dt**2] * 3 + [1e-5**2 * dt] * 3
     wanted = phi @ cov @ phi.T + np.diag(q)
@@ -147,18 +144,18 @@ def test_sequential_update_is_the_joint_one(seed: int, considered: int) -> None:
     root = rng.normal(size=(9, 9))
     cov, z, r = root @ root.T, rng.normal(size=3), rng.uniform(0.01, 1, 3)
     h = np.eye(9)[6:]
-    s = np.zeros(81 + 9 + 18)
-    s[:81] = cov.ravel()
+    s = attributes(np.zeros(1, record_type(*kalman.filter_fields(9))))[0]
+    s.P[:] = cov
     for i in range(3):
-        kalman.update(s, 0, 9, 81, 90, 6 + i, z[i], r[i], considered)
-    got = s[:81].reshape(9, 9)
+        kalman.update(s, 6 + i, z[i], r[i], considered)
+    got = s.P
     np.testing.assert_array_equal(got, got.T)
     if considered == 0:
         k, wanted = ref.joseph(cov, h, np.diag(r))
-        np.testing.assert_allclose(s[81:90], k @ z, rtol=1e-8, atol=1e-8)
+        np.testing.assert_allclose(s.dx, k @ z, rtol=1e-8, atol=1e-8)
         np.testing.assert_allclose(got, wanted, rtol=1e-8, atol=1e-8)
     else:
-        assert (s[81:84] == 0).all()
+        assert (s.dx[:3] == 0).all()
         np.testing.assert_allclose(got[:3, :3], cov[:3, :3], rtol=1e-12)
         assert np.linalg.eigvalsh(got).min() > 0
 
@@ -172,14 +169,14 @@ def test_madgwick_equals_the_published_matrices() -> None:
     force = rng.normal(size=(n, 3)) + np.array([0, 0, 9.81])
     for f, w in zip(force, rng.normal(size=(n, 3)), strict=True):
         q = ref.madgwick(q, f, w, 0.01, 0.1)
-        foot_9iez_mad.madgwick(s, 0, f[0], f[1], f[2], w[0], w[1], w[2], 0.01, 0.1)
+        foot_9iez_mad.madgwick(s, f[0], f[1], f[2], w[0], w[1], w[2], 0.01, 0.1)
     np.testing.assert_allclose(s, q, rtol=0, atol=1e-12)
 
 
 def test_madgwick_finds_down_from_a_wrong_start() -> None:
     s = np.array([np.cos(0.4), np.sin(0.4), 0, 0])
     for _ in range(20_000):
-        foot_9iez_mad.madgwick(s, 0, 0.0, 0.0, 9.81, 0.0, 0.0, 0.0, 0.01, 0.05)
+        foot_9iez_mad.madgwick(s, 0.0, 0.0, 9.81, 0.0, 0.0, 0.0, 0.01, 0.05)
     down = Rotation.from_quat(s, scalar_first=True).apply([0, 0, 1])
     assert np.degrees(np.arccos(down[2])) < 0.1
 
@@ -263,36 +260,32 @@ def test_any_mounting_is_levelled(angles: tuple[float, float]) -> None:
 @given(turn=st.tuples(*[st.floats(-3, 3)] * 3), start=st.tuples(*[st.floats(-3, 3)] * 3))
 def test_rotation_kernels(turn: tuple, start: tuple) -> None:
     c = Rotation.from_rotvec(start).as_matrix()
-    s = np.zeros(13)
-    s[:9] = c.ravel()
-    rotations.turn_body(s, 0, *turn)
-    np.testing.assert_allclose(s[:9].reshape(3, 3), c @ ref.pade(np.array(turn)), atol=1e-12)
-    s[:9] = c.ravel()
-    rotations.turn_nav(s, 0, *turn)
-    np.testing.assert_allclose(s[:9].reshape(3, 3), ref.pade(np.array(turn)) @ c, atol=1e-12)
-    rotations.quat_from_rot(s, 0, s, 9)
-    wanted = Rotation.from_matrix(s[:9].reshape(3, 3)).as_quat(canonical=True, scalar_first=True)
-    np.testing.assert_allclose(np.abs(s[9:] @ wanted), 1, atol=1e-12)
-    assert s[9] >= 0
-    back = np.zeros(9)
-    rotations.rot_from_quat(s, 9, back, 0)
-    np.testing.assert_allclose(back, s[:9], atol=1e-12)
+    rot = c.copy()
+    rotations.turn_body(rot, *turn)
+    np.testing.assert_allclose(rot, c @ ref.pade(np.array(turn)), atol=1e-12)
+    rot = c.copy()
+    rotations.turn_nav(rot, *turn)
+    np.testing.assert_allclose(rot, ref.pade(np.array(turn)) @ c, atol=1e-12)
+    quat = rotations.quat_of(rot)
+    wanted = Rotation.from_matrix(rot).as_quat(canonical=True, scalar_first=True)
+    np.testing.assert_allclose(np.abs(np.array(quat) @ wanted), 1, atol=1e-12)
+    assert quat[0] >= 0
+    back = np.zeros((3, 3))
+    rotations.set_quat(back, *quat)
+    np.testing.assert_allclose(back, rot, atol=1e-12)
 
 
 @pytest.mark.parametrize("axis", np.vstack([np.eye(3), -np.eye(3)]))
 def test_half_turns_keep_their_axis(axis: np.ndarray) -> None:
-    s = np.zeros(13)
-    s[:9] = Rotation.from_rotvec(np.pi * axis).as_matrix().ravel()
-    rotations.quat_from_rot(s, 0, s, 9)
-    np.testing.assert_allclose(np.abs(s[10:]), np.abs(axis), atol=1e-12)
+    quat = rotations.quat_of(Rotation.from_rotvec(np.pi * axis).as_matrix())
+    np.testing.assert_allclose(np.abs(quat[1:]), np.abs(axis), atol=1e-12)
 
 
 @given(seed=st.integers(0, 1000))
 def test_orthonormalize_takes_rounding_out(seed: int) -> None:
     c = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
-    s = (c + 1e-6 * np.random.default_rng(seed).normal(size=(3, 3))).ravel()
-    rotations.orthonormalize(s, 0)
-    got = s.reshape(3, 3)
+    got = c + 1e-6 * np.random.default_rng(seed).normal(size=(3, 3))
+    rotations.orthonormalize(got)
     np.testing.assert_allclose(got @ got.T, np.eye(3), atol=1e-10)
     np.testing.assert_allclose(got, c, atol=1e-5)
 
@@ -301,14 +294,13 @@ def test_rotation_stays_orthonormal_over_a_long_walk() -> None:
     rows, _ = long_walk()
     for name in ("foot.naive", "foot.9iez"):
         _, estimator = run(name, rows)
-        c = estimator.state[la.ROT : la.ROT + 9].reshape(3, 3)
+        c = estimator.record.rot
         np.testing.assert_allclose(c @ c.T, np.eye(3), atol=1e-11)
 
 
 def test_covariance_stays_symmetric_and_positive() -> None:
     rows, _ = long_walk()
-    for name, at, n in (("foot.9iez", foot_9iez.P, 9), ("foot.15iez-zaru", foot_15iez_zaru.P, 15)):
-        _, estimator = run(name, rows)
-        p = estimator.state[at : at + n * n].reshape(n, n)
+    for name in ("foot.9iez", "foot.15iez-zaru"):
+        p = run(name, rows)[1].record.P
         np.testing.assert_array_equal(p, p.T)
         assert np.linalg.eigvalsh(p).min() > -1e-15

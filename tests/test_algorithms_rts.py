@@ -47,12 +47,12 @@ def test_equals_the_textbook_recursion() -> None:
     rows = rows[:620]
     estimator: Any = make("foot.rts", **PARAMS)
     out = np.empty((len(rows), estimator.width))
-    logs = np.zeros((len(rows), f.LOG))
-    f.forward(estimator.state.copy(), rows, out, logs)
+    logs = np.zeros(len(rows), f.LOG)
+    f.forward(*estimator.views(estimator.state.copy()), rows, out, logs)
     smoothed = smooth(rows, **PARAMS)
 
-    first = int(np.flatnonzero(logs[:, f.L_ACTIVE] == 1)[0])
-    shift, cov = np.zeros(15), logs[-1, f.L_P :].reshape(15, 15)
+    first = int(np.flatnonzero(logs["stage"] == f.START)[0])
+    shift, cov = np.zeros(15), logs[-1]["P"]
     found = columns(smoothed, "pose", *POSE), columns(smoothed, "velocity"), columns(smoothed, "sigma")
     filtered = out[:, :3], out[:, 7:10]
     for k in range(len(rows) - 1, first, -1):
@@ -61,17 +61,14 @@ def test_equals_the_textbook_recursion() -> None:
         sigma = np.sqrt(np.diag(cov))[[6, 7, 8, 9, 10, 11, 0, 1, 2]]
         np.testing.assert_allclose(found[2][k], sigma, atol=2e-8)
         log, before = logs[k], logs[k - 1]
-        p = before[f.L_P :].reshape(15, 15)
-        dt = log[f.L_DT]
-        trans = transition15(
-            log[f.L_FORCE : f.L_FORCE + 3], log[f.L_ROT_PRIOR : f.L_ROT_PRIOR + 9].reshape(3, 3), dt
-        )
+        p = before["P"]
+        dt = log["dt"]
+        trans = transition15(log["force"], log["rot"], dt)
         q = np.repeat([0.02**2 * dt**2, 1e-4**2 * dt, 0.0, 0.2**2 * dt**2, 1e-3**2 * dt], 3)
         prior = trans @ p @ trans.T + np.diag(q)
         correction = np.zeros(15)  # what the updates of sample k added to the state
-        for u in range(int(log[f.L_UPDATES])):
-            at = f.L_UPDATE + u * 18
-            correction -= log[at + 3 : at + 18] * log[at + 1]
+        for u in range(log["n_updates"]):
+            correction -= log["gain"][u] * log["residual"][u]
         scale = np.sqrt(np.where(np.diag(prior) > 0, np.diag(prior), 1.0))
         inverse = np.linalg.pinv(prior / np.outer(scale, scale), rcond=1e-13) / np.outer(scale, scale)
         gain = p @ trans.T @ inverse

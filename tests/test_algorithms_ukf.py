@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from marcha.algorithms import make
-from marcha.algorithms.foot import layout as la
 from marcha.algorithms.foot import ukf as foot_ukf
-from marcha.algorithms.foot.iez9 import P
 from scipy.spatial.transform import Rotation
 
 from .algorithms_support import columns, run, simulated
@@ -24,9 +22,9 @@ def test_prediction_equals_sampling(sigma_att: float) -> None:
     sd = np.array([1.0, 0.6, 0.8, 0.1, 0.2, 0.3, 0.05, 0.04, 0.03])
     sd[:3] *= sigma_att
     estimator: Any = make("foot.ukf", sigma_gyr=0.0, sigma_acc=0.0)
-    state = estimator.state
-    state[P : P + 81] = np.diag(sd**2).ravel()
-    state[foot_ukf.FORCE : foot_ukf.FORCE + 3] = FORCE
+    state = estimator.record
+    state.P[:] = np.diag(sd**2)
+    state.step_force[:] = FORCE
     foot_ukf.predict(state, dt)
 
     error = rng.standard_normal((n, 9)) * sd
@@ -37,9 +35,9 @@ def test_prediction_equals_sampling(sigma_att: float) -> None:
     # The transform is exact to second order for the mean: what is left is of fourth order in the angle.
     left = 0.2 * sigma_att**4 * np.linalg.norm(FORCE) * dt
     noise = 5 * after[:, 6:].std(axis=0) / np.sqrt(n)
-    assert np.all(np.abs(-state[la.VEL : la.VEL + 3] - velocity.mean(axis=0)) < noise + left)
+    assert np.all(np.abs(-state.vel - velocity.mean(axis=0)) < noise + left)
     measured = np.cov(after.T)
-    found = state[P : P + 81].reshape(9, 9)
+    found = state.P
     if sigma_att < 0.1:
         scale = np.sqrt(np.outer(np.diag(measured), np.diag(measured)))
         assert np.max(np.abs(found - measured) / scale) < 0.01
@@ -72,7 +70,6 @@ def test_root_of_a_semidefinite_matrix(rank: int) -> None:
     half = np.zeros((9, 9))
     half[:, :rank] = rng.standard_normal((9, rank))
     matrix = half @ half.T
-    state = np.concatenate([matrix.ravel(), np.full(81, np.nan)])
-    foot_ukf.semidefinite_root(state, 0, 81, 9)
-    root = state[81:].reshape(9, 9)
+    root = np.full((9, 9), np.nan)
+    foot_ukf.semidefinite_root(matrix, root)
     np.testing.assert_allclose(root @ root.T, matrix, atol=1e-6)

@@ -51,7 +51,7 @@ def test_a_configuration_is_read_without_importing_its_estimators() -> None:
         import sys
         from marcha.study import load
         load("foot-simulated")
-        print([m for m in sys.modules if m.startswith(("numba", "marcha.algorithms.foot.common"))])"""
+        print([m for m in sys.modules if m.startswith(("numba", "marcha.algorithms.foot.core"))])"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
 

@@ -11,9 +11,7 @@ import polars as pl
 from ..recording import Recording
 from ..recording.atomic import AtomicFile
 from ..recording.errors import UsageError
-from ..replay.sinks import Sink
 from . import viewer
-from .text import printable
 from .viewer import Viewer
 
 if TYPE_CHECKING:
@@ -59,8 +57,7 @@ def show(
     """
     import rerun as rr
 
-    from .draw import draw
-    from .stream import finish, new_stream, release
+    from .draw import draw, new_stream
 
     recs = [recs] if isinstance(recs, Recording) else list(recs)
     window = viewer.web(open_browser=open_browser) if web else viewer.native()
@@ -70,9 +67,8 @@ def show(
         stream = new_stream()
         stream.set_sinks(rr.GrpcSink(viewer.uri(window.port)))
         draw(recs, stream)
-        finish(stream)
-        del stream
-        release()
+        stream.flush()
+        stream.disconnect()
         if wait if wait is not None else web:
             with window:
                 window.wait()
@@ -87,7 +83,7 @@ _BEAT_NS = 100_000_000
 and topic would not keep up with real time."""
 
 
-class LiveSink(Sink):
+class LiveSink:
     """A replay's sink that shows everything as it comes: in a file, a viewer, a browser, or all of them.
 
     Parameters
@@ -130,7 +126,7 @@ class LiveSink(Sink):
         """Open the file and the viewers."""
         import rerun as rr
 
-        from .stream import new_stream
+        from .draw import new_stream
 
         self._plan = plan
         sinks: list[rr.FileSink | rr.GrpcSink] = []
@@ -145,7 +141,7 @@ class LiveSink(Sink):
             sinks += [rr.GrpcSink(viewer.uri(v.port)) for v in self.viewers]
             self._stream = new_stream()
             self._stream.set_sinks(*sinks)
-            self._stream.send_recording_name(printable(Path(plan.source).stem))
+            self._stream.send_recording_name(Path(plan.source).stem)
         except BaseException:
             self._abort()
             raise
@@ -176,9 +172,9 @@ class LiveSink(Sink):
         import rerun as rr
 
         from .blueprint import blueprint, extent
+        from .draw import finish
+        from .plan import log_plan
         from .report import replay_report
-        from .stream import finish, release, send_blueprint
-        from .top_view import log_top_view
 
         if result is None:
             self._abort()
@@ -188,16 +184,11 @@ class LiveSink(Sink):
             scene = self._begun(0)
             scene.end()
             text = rr.TextDocument(replay_report(result), media_type=rr.MediaType.MARKDOWN)
-            canvas = scene.canvas
-            canvas.static(f"{canvas.prefix}/report", text)
-            log_top_view(self._stream, *extent([canvas]))
+            scene.static(f"{scene.prefix}/report", text)
+            log_plan(self._stream, *extent([scene]))
             # the saved view opens at the whole track; open viewers keep what their user has arranged
-            send_blueprint(self._stream, blueprint([canvas]), make_active=False)
+            self._stream.send_blueprint(blueprint([scene]), make_active=False)
             finish(self._stream, self._file)
-            del scene, canvas
-            self._scene = None
-            del self._stream
-            release()
         except BaseException:
             self._abort()
             raise
@@ -211,17 +202,15 @@ class LiveSink(Sink):
             window.close()
 
     def _begun(self, t_ns: int) -> Scene:
-        """Return the scene; where time begins is known with the first message."""
+        """Return the scene; its clock is known with the first message."""
         from .blueprint import blueprint, extent
+        from .draw import clock_from
+        from .plan import log_plan
         from .scene import Scene
-        from .stream import send_blueprint
-        from .timeaxis import axis_from
-        from .top_view import log_top_view
 
         if self._scene is None:
-            self._scene = Scene(self._stream, self._plan.channels.values(), axis_from(t_ns))
+            self._scene = Scene(self._stream, self._plan.channels.values(), clock_from(t_ns))
             self._scene.begin()
-            canvas = self._scene.canvas
-            log_top_view(self._stream, *extent([canvas]))  # 10 m by 10 m until more is known
-            send_blueprint(self._stream, blueprint([canvas], live=True))
+            log_plan(self._stream, *extent([self._scene]))  # a room of 10 m until more is known
+            self._stream.send_blueprint(blueprint([self._scene], live=True))
         return self._scene

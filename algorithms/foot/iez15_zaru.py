@@ -4,46 +4,42 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, ClassVar
 
 from ..contract import FloatArray
-from ..numerics import kalman
+from ..numerics import kalman, strapdown
 from ..numerics.compiled import compiled, inlined
+from ..numerics.records import Fields, record_type
 from ..numerics.rotations import orthonormalize, turn_nav
 from ..parameters import meta
-from . import aiding, strapdown
-from . import common as foot
+from . import core
 from . import iez9 as base
-from . import layout as la
-from .layout import (
-    ACC_N,
-    BIAS_ACC,
-    BIAS_GYR,
-    POS,
-    R_DT,
-    R_GYR,
-    R_STILL,
-    ROT,
-    STARTED,
-    VEL,
-)
+from .aiding import AIDS, AidedEstimator, AidingParams, aid
+from .parameters import with_parts
 
 N = 15
-ATT, BGYR, XPOS, XVEL, BACC = 0, 3, 6, 9, 12
+ATT, BIAS_GYR, POS, VEL, BIAS_ACC = 0, 3, 6, 9, 12
+"""First error states of attitude, gyroscope bias, position, velocity and accelerometer bias."""
 
-_take = la.Allocator(aiding.SIZE)
-Q_GYR = _take()
-Q_ACC = _take()
-Q_GYR_WALK = _take()
-Q_ACC_WALK = _take()
-R_VEL = _take()
-R_ZARU = _take()
-ZARU_AFTER = _take()
-ZARU_RATE = _take()
-P = _take(N * N)
-DX = _take(N)
-WORK = _take(2 * N)
-SIZE = _take.size
+FILTER: Fields = [
+    ("q_gyr", "f8"),
+    ("q_acc", "f8"),
+    ("q_gyr_walk", "f8"),
+    ("q_acc_walk", "f8"),
+    ("r_vel", "f8"),
+    ("r_zaru", "f8"),
+    ("zaru_after", "f8"),
+    ("zaru_rate", "f8"),
+    *kalman.filter_fields(N),
+]
+"""Fields of a state with the fifteen-state filter, before the core's."""
+
+RECORD = record_type(
+    *FILTER,
+    ("aids", AIDS),
+    *core.CORE,
+)
 
 
 class Foot15IezZaruParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -77,95 +73,107 @@ class Foot15IezZaruParams(base.Foot9IezParams, frozen=True, forbid_unknown_field
     ] = 0.05
 
 
-Foot15IezZaruAidedParams = aiding.with_aids(Foot15IezZaruParams, "Foot15IezZaruAidedParams", __name__)
+Foot15IezZaruAidedParams = with_parts(Foot15IezZaruParams, "Foot15IezZaruAidedParams", __name__, AidingParams)
 
 
 @inlined
-def predict(s: FloatArray, dt: float) -> None:
+def predict(s: Any, dt: float) -> None:
     """Carry P over one time step: F P Fᵀ + Q (eqs 3.34–3.37 with the bias columns of 3.43)."""
-    kalman.predict_motion(s, P, N, ATT, XPOS, XVEL, ACC_N, dt)
-    kalman.predict_bias(s, P, N, XVEL, BACC, ROT, dt)
-    kalman.predict_bias(s, P, N, ATT, BGYR, ROT, dt)
-    kalman.add_noise(s, P, N, ATT, s[Q_GYR] * dt * dt)
-    kalman.add_noise(s, P, N, XVEL, s[Q_ACC] * dt * dt)
-    kalman.add_noise(s, P, N, BGYR, s[Q_GYR_WALK] * dt)
-    kalman.add_noise(s, P, N, BACC, s[Q_ACC_WALK] * dt)
-    kalman.mirror(s, P, N)
+    kalman.predict_motion(s.P, ATT, POS, VEL, s.force, dt)
+    kalman.predict_bias(s.P, VEL, BIAS_ACC, s.rot, dt)
+    kalman.predict_bias(s.P, ATT, BIAS_GYR, s.rot, dt)
+    kalman.add_noise(s.P, ATT, s.q_gyr * dt * dt)
+    kalman.add_noise(s.P, VEL, s.q_acc * dt * dt)
+    kalman.add_noise(s.P, BIAS_GYR, s.q_gyr_walk * dt)
+    kalman.add_noise(s.P, BIAS_ACC, s.q_acc_walk * dt)
+    kalman.mirror(s.P)
 
 
 @compiled
-def correct(s: FloatArray, r: int) -> None:
+def correct(s: Any, r: Any) -> None:
     """Correct by zero velocity and, where the foot really rests, by zero angular rate (eq 3.44)."""
-    kalman.clear(s, DX, N)
+    kalman.clear(s.dx)
     for i in range(3):
-        kalman.update(s, P, N, DX, WORK, XVEL + i, s[VEL + i], s[R_VEL], 0)
-    if foot.at_rest(s, r, s[ZARU_AFTER], s[ZARU_RATE]):
+        kalman.update(s, VEL + i, s.vel[i], s.r_vel, 0)
+    if core.at_rest(s, r, s.zaru_after, s.zaru_rate):
         for i in range(3):
             # Measured rate = true bias at rest, so the bias estimate's error is seen directly.
-            seen = s[BIAS_GYR + i] - s[r + R_GYR + i]
-            kalman.update(s, P, N, DX, WORK, BGYR + i, seen, s[R_ZARU], 0)
+            kalman.update(s, BIAS_GYR + i, s.bias_gyr[i] - r.gyr[i], s.r_zaru, 0)
     feed_back(s)
 
 
 @inlined
-def feed_back(s: FloatArray) -> None:
-    """Take the errors in ``DX`` out of position, velocity, biases and attitude."""
+def feed_back(s: Any) -> None:
+    """Take the errors in ``s.dx`` out of position, velocity, biases and attitude."""
     for i in range(3):
-        s[POS + i] -= s[DX + XPOS + i]
-        s[VEL + i] -= s[DX + XVEL + i]
-        s[BIAS_GYR + i] -= s[DX + BGYR + i]
-        s[BIAS_ACC + i] -= s[DX + BACC + i]
-    turn_nav(s, ROT, -s[DX + ATT], -s[DX + ATT + 1], -s[DX + ATT + 2])
-    orthonormalize(s, ROT)
+        s.pos[i] -= s.dx[POS + i]
+        s.vel[i] -= s.dx[VEL + i]
+        s.bias_gyr[i] -= s.dx[BIAS_GYR + i]
+        s.bias_acc[i] -= s.dx[BIAS_ACC + i]
+    turn_nav(s.rot, -s.dx[ATT], -s.dx[ATT + 1], -s.dx[ATT + 2])
+    orthonormalize(s.rot)
 
 
 @compiled
-def _navigate(s: FloatArray, out: FloatArray) -> None:
-    r = foot.release(s)
-    if not foot.starts(s) and s[STARTED] > 0.5:
+def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
+    r = core.release(s, ring)
+    if not core.starts(s) and s.started:
         strapdown.advance(s, r)
-        predict(s, s[r + R_DT])
-        if s[r + R_STILL] > 0.5:
+        predict(s, r.dt)
+        if r.still:
             correct(s, r)
-    if s[aiding.ON] > 0.5 and aiding.aid(s, r, P, N, ATT, XPOS, DX, WORK):
+    if s.aids.on and aid(s, r, ATT, POS):
         feed_back(s)
-    foot.emit(s, r, out)
-    foot.emit_sigma(s, P, N, XPOS, XVEL, ATT, out)
-    foot.emit_detector(s, r, base.FIRST_DETECTOR, out)
+    core.emit(s, r, out)
+    core.emit_sigma(s, POS, VEL, ATT, out)
+    core.emit_detector(r, core.AFTER_SIGMA, out)
 
 
 @compiled
-def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
+def kernel(state: Any, ring: Any, row: FloatArray, out: FloatArray) -> bool:
     """Take one row; fill ``out`` and return True where a result is due."""
-    if not foot.take(state, row):
+    s = state[0]
+    if not core.take(s, ring, row):
         return False
-    _navigate(state, out)
+    _navigate(s, ring, out)
     return True
 
 
 @compiled
-def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
-    """Take all rows; see :class:`..contract.RowKernel`."""
+def run(state: Any, ring: Any, rows: FloatArray, out: FloatArray) -> int:
+    """Take all rows; a row without a result is NaN. Return the number of results."""
     results = 0
     for i in range(rows.shape[0]):
-        if kernel(state, rows[i], out[i]):
+        if kernel(state, ring, rows[i], out[i]):
             results += 1
         else:
-            out[i, :] = float("nan")
+            out[i, :] = math.nan
     return results
 
 
 @compiled
-def flush(state: FloatArray, out: FloatArray) -> int:
+def flush(state: Any, ring: Any, out: FloatArray) -> int:
     """Fill ``out`` with the results still held back, return their number."""
+    s = state[0]
     results = 0
-    while results < out.shape[0] and foot.take_end(state):
-        _navigate(state, out[results])
+    while results < out.shape[0] and core.take_end(s, ring):
+        _navigate(s, ring, out[results])
         results += 1
     return results
 
 
-class Foot15IezZaru(aiding.AidedEstimator):
+def configure(record: Any, params: Any) -> None:
+    """Write the noise variances, the gates and the initial covariance into a state's record."""
+    record.q_gyr, record.q_acc = params.sigma_gyr**2, params.sigma_acc**2
+    record.q_gyr_walk, record.q_acc_walk = params.sigma_gyr_walk**2, params.sigma_acc_walk**2
+    record.r_vel, record.r_zaru = params.sigma_zupt**2, params.sigma_zaru**2
+    record.zaru_after, record.zaru_rate = params.zaru_after_s, params.zaru_gyr_max
+    for i in range(3):
+        record.P[BIAS_GYR + i, BIAS_GYR + i] = params.sigma_gyr_bias0**2
+        record.P[BIAS_ACC + i, BIAS_ACC + i] = params.sigma_acc_bias0**2
+
+
+class Foot15IezZaru(AidedEstimator):
     """Error-state Kalman filter with fifteen states, zero-velocity and zero-angular-rate updates.
 
     Source: foot-navigation dissertation, eqs 3.43–3.44. δx = [δφ, δω_b, δp, δv, δa_b], error = estimate −
@@ -183,18 +191,12 @@ class Foot15IezZaru(aiding.AidedEstimator):
     source: ClassVar[str] = "foot-navigation dissertation, eqs 3.43–3.44"
     Params = Foot15IezZaruAidedParams
     presets: ClassVar[dict[str, dict[str, Any]]] = base.PRESETS
-    state_size: ClassVar[int] = SIZE
+    RECORD = RECORD
     kernel = staticmethod(kernel)
     run = staticmethod(run)
     flush_kernel = staticmethod(flush)
 
-    def configure(self, params: Any) -> None:
+    def configure(self, record: Any, params: Any) -> None:
         """Write the noise variances, the gates and the initial covariance into the state."""
-        s = self.state
-        s[Q_GYR], s[Q_ACC] = params.sigma_gyr**2, params.sigma_acc**2
-        s[Q_GYR_WALK], s[Q_ACC_WALK] = params.sigma_gyr_walk**2, params.sigma_acc_walk**2
-        s[R_VEL], s[R_ZARU] = params.sigma_zupt**2, params.sigma_zaru**2
-        s[ZARU_AFTER], s[ZARU_RATE] = params.zaru_after_s, params.zaru_gyr_max
-        for i in range(3):
-            s[P + (BGYR + i) * (N + 1)] = params.sigma_gyr_bias0**2
-            s[P + (BACC + i) * (N + 1)] = params.sigma_acc_bias0**2
+        super().configure(record, params)
+        configure(record, params)

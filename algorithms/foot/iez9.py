@@ -2,45 +2,43 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, ClassVar
 
 from ..contract import FloatArray
-from ..numerics import kalman
+from ..numerics import kalman, strapdown
 from ..numerics.compiled import compiled, inlined
+from ..numerics.records import Fields, record_type
 from ..numerics.rotations import orthonormalize, turn_nav
 from ..parameters import meta
-from . import aiding, strapdown
-from . import common as foot
-from . import layout as la
-from .layout import (
-    ACC_N,
-    POS,
-    R_DT,
-    R_STILL,
-    ROT,
-    STARTED,
-    VEL,
-)
+from . import core
+from .aiding import AIDS, AidedEstimator, AidingParams, aid
+from .estimator import FootEstimator
+from .parameters import FootParams, with_parts
 
 N = 9
-ATT, XPOS, XVEL = 0, 3, 6
+ATT, POS, VEL = 0, 3, 6
+"""First error states of attitude, position and velocity."""
 
-_take = la.Allocator(aiding.SIZE)
-Q_GYR = _take()  # σ_ω², per unit of Δt²
-Q_ACC = _take()
-R_VEL = _take()
-P = _take(N * N)
-DX = _take(N)
-WORK = _take(2 * N)
-SIZE = _take.size
+FILTER: Fields = [
+    ("q_gyr", "f8"),  # σ_ω², per unit of Δt²
+    ("q_acc", "f8"),
+    ("r_vel", "f8"),
+    *kalman.filter_fields(N),
+]
+"""Fields of a state with the nine-state filter, before the core's."""
 
-FIRST_DETECTOR = la.O_REST + 9
+RECORD = record_type(
+    *FILTER,
+    ("aids", AIDS),
+    *core.CORE,
+)
 
-PRESETS = foot.FootEstimator.presets | {"device": {"gravity_from_rest": True, "sigma_acc": 0.16}}
+PRESETS = FootEstimator.presets | {"device": {"gravity_from_rest": True, "sigma_acc": 0.16}}
 """``device``: as sure as the errors of an uncalibrated MPU-6050 allow (docs/estimators.md)."""
 
 
-class Foot9IezParams(foot.FootParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class Foot9IezParams(FootParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Parameters of the nine-state filter."""
 
     sigma_gyr: Annotated[
@@ -61,92 +59,94 @@ class Foot9IezParams(foot.FootParams, frozen=True, forbid_unknown_fields=True, k
     ] = 0.01
 
 
-Foot9IezAidedParams = aiding.with_aids(Foot9IezParams, "Foot9IezAidedParams", __name__)
+Foot9IezAidedParams = with_parts(Foot9IezParams, "Foot9IezAidedParams", __name__, AidingParams)
 
 
 @inlined
-def predict(s: FloatArray, dt: float) -> None:
-    """Carry P over one time step: F P Fᵀ + Q with f_n in ``ACC_N`` (eqs 3.34–3.37)."""
-    kalman.predict_motion(s, P, N, ATT, XPOS, XVEL, ACC_N, dt)
-    kalman.add_noise(s, P, N, ATT, s[Q_GYR] * dt * dt)
-    kalman.add_noise(s, P, N, XVEL, s[Q_ACC] * dt * dt)
-    kalman.mirror(s, P, N)
+def predict(s: Any, dt: float) -> None:
+    """Carry P over one time step: F P Fᵀ + Q with f_n in ``s.force`` (eqs 3.34–3.37)."""
+    kalman.predict_motion(s.P, ATT, POS, VEL, s.force, dt)
+    kalman.add_noise(s.P, ATT, s.q_gyr * dt * dt)
+    kalman.add_noise(s.P, VEL, s.q_acc * dt * dt)
+    kalman.mirror(s.P)
 
 
 @compiled
-def zero_velocity(s: FloatArray, considered: int) -> None:
-    """Correct by zero velocity (eqs 3.38–3.42); the first ``considered`` error states are left alone."""
-    kalman.clear(s, DX, N)
+def zero_velocity(s: Any, n_considered: int) -> None:
+    """Correct by zero velocity (eqs 3.38–3.42); the first ``n_considered`` error states are left alone."""
+    kalman.clear(s.dx)
     for i in range(3):
-        kalman.update(s, P, N, DX, WORK, XVEL + i, s[VEL + i], s[R_VEL], considered)
-    feed_back(s, considered)
+        kalman.update(s, VEL + i, s.vel[i], s.r_vel, n_considered)
+    feed_back(s, n_considered)
 
 
 @inlined
-def feed_back(s: FloatArray, considered: int) -> None:
-    """Take the errors in ``DX`` out of position, velocity and, unless it is considered, attitude."""
+def feed_back(s: Any, n_considered: int) -> None:
+    """Take the errors in ``s.dx`` out of position, velocity and, unless it is considered, attitude."""
     for i in range(3):
-        s[POS + i] -= s[DX + XPOS + i]
-        s[VEL + i] -= s[DX + XVEL + i]
-    if considered == 0:
-        turn_nav(s, ROT, -s[DX + ATT], -s[DX + ATT + 1], -s[DX + ATT + 2])
-        orthonormalize(s, ROT)
+        s.pos[i] -= s.dx[POS + i]
+        s.vel[i] -= s.dx[VEL + i]
+    if n_considered == 0:
+        turn_nav(s.rot, -s.dx[ATT], -s.dx[ATT + 1], -s.dx[ATT + 2])
+        orthonormalize(s.rot)
 
 
 @compiled
-def _navigate(s: FloatArray, out: FloatArray) -> None:
-    r = foot.release(s)
-    if not foot.starts(s) and s[STARTED] > 0.5:
+def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
+    r = core.release(s, ring)
+    if not core.starts(s) and s.started:
         strapdown.advance(s, r)
-        predict(s, s[r + R_DT])
-        if s[r + R_STILL] > 0.5:
+        predict(s, r.dt)
+        if r.still:
             zero_velocity(s, 0)
-    if s[aiding.ON] > 0.5 and aiding.aid(s, r, P, N, ATT, XPOS, DX, WORK):
+    if s.aids.on and aid(s, r, ATT, POS):
         feed_back(s, 0)
-    foot.emit(s, r, out)
-    foot.emit_sigma(s, P, N, XPOS, XVEL, ATT, out)
-    foot.emit_detector(s, r, FIRST_DETECTOR, out)
+    core.emit(s, r, out)
+    core.emit_sigma(s, POS, VEL, ATT, out)
+    core.emit_detector(r, core.AFTER_SIGMA, out)
 
 
 @compiled
-def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
+def kernel(state: Any, ring: Any, row: FloatArray, out: FloatArray) -> bool:
     """Take one row; fill ``out`` and return True where a result is due."""
-    if not foot.take(state, row):
+    s = state[0]
+    if not core.take(s, ring, row):
         return False
-    _navigate(state, out)
+    _navigate(s, ring, out)
     return True
 
 
 @compiled
-def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
-    """Take all rows; see :class:`..contract.RowKernel`."""
+def run(state: Any, ring: Any, rows: FloatArray, out: FloatArray) -> int:
+    """Take all rows; a row without a result is NaN. Return the number of results."""
     results = 0
     for i in range(rows.shape[0]):
-        if kernel(state, rows[i], out[i]):
+        if kernel(state, ring, rows[i], out[i]):
             results += 1
         else:
-            out[i, :] = float("nan")
+            out[i, :] = math.nan
     return results
 
 
 @compiled
-def flush(state: FloatArray, out: FloatArray) -> int:
+def flush(state: Any, ring: Any, out: FloatArray) -> int:
     """Fill ``out`` with the results still held back, return their number."""
+    s = state[0]
     results = 0
-    while results < out.shape[0] and foot.take_end(state):
-        _navigate(state, out[results])
+    while results < out.shape[0] and core.take_end(s, ring):
+        _navigate(s, ring, out[results])
         results += 1
     return results
 
 
-def configure(state: FloatArray, params: Any) -> None:
-    """Write the noise variances of the nine-state filter into ``state``."""
-    state[Q_GYR] = params.sigma_gyr**2
-    state[Q_ACC] = params.sigma_acc**2
-    state[R_VEL] = params.sigma_zupt**2
+def configure(record: Any, params: Any) -> None:
+    """Write the noise variances of the nine-state filter into a state's record."""
+    record.q_gyr = params.sigma_gyr**2
+    record.q_acc = params.sigma_acc**2
+    record.r_vel = params.sigma_zupt**2
 
 
-class Foot9Iez(aiding.AidedEstimator):
+class Foot9Iez(AidedEstimator):
     """Error-state Kalman filter with nine states (attitude, position, velocity) and zero-velocity updates.
 
     Source: foot-navigation dissertation, eqs 3.28–3.42 (after Jiménez et al. 2010). F = [[I, 0, 0], [0, I,
@@ -162,11 +162,12 @@ class Foot9Iez(aiding.AidedEstimator):
     source: ClassVar[str] = "foot-navigation dissertation, eqs 3.28–3.42"
     Params = Foot9IezAidedParams
     presets: ClassVar[dict[str, dict[str, Any]]] = PRESETS
-    state_size: ClassVar[int] = SIZE
+    RECORD = RECORD
     kernel = staticmethod(kernel)
     run = staticmethod(run)
     flush_kernel = staticmethod(flush)
 
-    def configure(self, params: Any) -> None:
+    def configure(self, record: Any, params: Any) -> None:
         """Write the noise variances into the state; P starts at zero."""
-        configure(self.state, params)
+        super().configure(record, params)
+        configure(record, params)

@@ -6,42 +6,36 @@ import math
 from typing import Annotated, Any, ClassVar
 
 from ..contract import FloatArray
-from ..numerics import kalman
+from ..numerics import kalman, strapdown
 from ..numerics.compiled import compiled, inlined
+from ..numerics.records import record_type
 from ..numerics.rotations import orthonormalize, turn_nav
 from ..parameters import meta
-from . import common as foot
+from . import core
 from . import iez9 as base
-from . import layout as la
-from . import strapdown
-from .layout import (
-    ACC_N,
-    BIAS_GYR,
-    GRAVITY,
-    R_DT,
-    R_GYR,
-    R_NORM_ACC,
-    R_STILL,
-    ROT,
-    STARTED,
+from .estimator import FootEstimator
+from .parameters import with_parts
+
+TILT, BIAS = 0, 3
+"""First error states of the orientation filter: attitude in n, gyroscope bias."""
+
+ORIENTATION = record_type(
+    ("q_turn", "f8"),
+    ("q_bias", "f8"),
+    ("r_level", "f8"),
+    ("level_gate", "f8"),
+    ("r_zaru", "f8"),
+    ("zaru_after", "f8"),
+    ("zaru_rate", "f8"),
+    *kalman.filter_fields(6),
 )
 
-M = 6
-TILT, BIAS = 0, 3
-
-_take = la.Allocator(base.SIZE)
-FEEDBACK = _take()
-Q_TURN = _take()
-Q_BIAS = _take()
-R_LEVEL = _take()
-LEVEL_GATE = _take()
-R_ZARU = _take()
-ZARU_AFTER = _take()
-ZARU_RATE = _take()
-P = _take(M * M)
-DX = _take(M)
-WORK = _take(2 * M)
-SIZE = _take.size
+RECORD = record_type(
+    *base.FILTER,
+    ("zupt_turns", "?"),
+    ("orientation", ORIENTATION),
+    *core.CORE,
+)
 
 
 class Foot9IezKfParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -88,101 +82,107 @@ class Foot9IezKfParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=T
     ] = False
 
 
+Foot9IezKfAllParams = with_parts(Foot9IezKfParams, "Foot9IezKfAllParams", __name__)
+
+
 @inlined
-def _predict(s: FloatArray, dt: float) -> None:
-    kalman.predict_bias(s, P, M, TILT, BIAS, ROT, dt)
-    kalman.add_noise(s, P, M, TILT, s[Q_TURN] * dt * dt)
-    kalman.add_noise(s, P, M, BIAS, s[Q_BIAS] * dt)
-    kalman.mirror(s, P, M)
+def _predict(s: Any, dt: float) -> None:
+    o = s.orientation
+    kalman.predict_bias(o.P, TILT, BIAS, s.rot, dt)
+    kalman.add_noise(o.P, TILT, o.q_turn * dt * dt)
+    kalman.add_noise(o.P, BIAS, o.q_bias * dt)
+    kalman.mirror(o.P)
 
 
 @compiled
-def _correct(s: FloatArray, r: int) -> None:
-    """Level by the accelerometer and take the bias from a rest, where the sample at ``r`` allows."""
-    if s[r + R_STILL] < 0.5:
+def _correct(s: Any, r: Any) -> None:
+    """Level by the accelerometer and take the bias from a rest, where the sample ``r`` allows."""
+    o = s.orientation
+    if not r.still:
         return
-    level = abs(s[r + R_NORM_ACC] - s[GRAVITY]) < s[LEVEL_GATE]
-    rest = foot.at_rest(s, r, s[ZARU_AFTER], s[ZARU_RATE])
-    if not (level or rest):
+    is_level = abs(r.acc_norm - s.gravity) < o.level_gate
+    is_rest = core.at_rest(s, r, o.zaru_after, o.zaru_rate)
+    if not (is_level or is_rest):
         return
-    kalman.clear(s, DX, M)
-    if level:
+    kalman.clear(o.dx)
+    if is_level:
         # Estimated f_n = (I + [δφ]×)(0, 0, g): its horizontal part is (g δφ_y, −g δφ_x).
-        g = s[GRAVITY]
-        variance = s[R_LEVEL] / (g * g)
-        kalman.update(s, P, M, DX, WORK, TILT, -s[ACC_N + 1] / g, variance, 0)
-        kalman.update(s, P, M, DX, WORK, TILT + 1, s[ACC_N] / g, variance, 0)
-    if rest:
+        g = s.gravity
+        variance = o.r_level / (g * g)
+        kalman.update(o, TILT, -s.force[1] / g, variance, 0)
+        kalman.update(o, TILT + 1, s.force[0] / g, variance, 0)
+    if is_rest:
         for i in range(3):
-            seen = s[BIAS_GYR + i] - s[r + R_GYR + i]
-            kalman.update(s, P, M, DX, WORK, BIAS + i, seen, s[R_ZARU], 0)
-    turn_nav(s, ROT, -s[DX], -s[DX + 1], -s[DX + 2])
-    orthonormalize(s, ROT)
+            kalman.update(o, BIAS + i, s.bias_gyr[i] - r.gyr[i], o.r_zaru, 0)
+    turn_nav(s.rot, -o.dx[TILT], -o.dx[TILT + 1], -o.dx[TILT + 2])
+    orthonormalize(s.rot)
     for i in range(3):
-        s[BIAS_GYR + i] -= s[DX + BIAS + i]
+        s.bias_gyr[i] -= o.dx[BIAS + i]
 
 
 @inlined
-def _advance(s: FloatArray, r: int) -> None:
+def _advance(s: Any, r: Any) -> None:
     strapdown.resolve(s, r)
-    x, y, z = s[ACC_N], s[ACC_N + 1], s[ACC_N + 2]
+    x, y, z = s.force[0], s.force[1], s.force[2]
     strapdown.turn(s, r)
-    _predict(s, s[r + R_DT])
+    _predict(s, r.dt)
     strapdown.resolve(s, r)
     _correct(s, r)
     strapdown.resolve(s, r)
     strapdown.average_force(s, x, y, z)
-    strapdown.move(s, s[r + R_DT])
+    strapdown.move(s, r.dt)
 
 
 @compiled
-def _navigate(s: FloatArray, out: FloatArray) -> None:
-    r = foot.release(s)
-    if not foot.starts(s) and s[STARTED] > 0.5:
+def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
+    r = core.release(s, ring)
+    if not core.starts(s) and s.started:
         _advance(s, r)
-        base.predict(s, s[r + R_DT])
-        if s[r + R_STILL] > 0.5:
-            base.zero_velocity(s, 0 if s[FEEDBACK] > 0.5 else 3)
-    foot.emit(s, r, out)
-    foot.emit_sigma(s, base.P, base.N, base.XPOS, base.XVEL, base.ATT, out)
-    for i in range(3):
-        if s[STARTED] > 0.5:
-            out[la.O_REST + 6 + i] = math.sqrt(max(0.0, s[P + i * (M + 1)]))
-    foot.emit_detector(s, r, base.FIRST_DETECTOR, out)
+        base.predict(s, r.dt)
+        if r.still:
+            base.zero_velocity(s, 0 if s.zupt_turns else base.POS)
+    core.emit(s, r, out)
+    core.emit_sigma(s, base.POS, base.VEL, base.ATT, out)
+    if s.started:
+        for i in range(3):
+            out[core.SIGMA + 6 + i] = math.sqrt(max(0.0, s.orientation.P[i, i]))
+    core.emit_detector(r, core.AFTER_SIGMA, out)
 
 
 @compiled
-def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
+def kernel(state: Any, ring: Any, row: FloatArray, out: FloatArray) -> bool:
     """Take one row; fill ``out`` and return True where a result is due."""
-    if not foot.take(state, row):
+    s = state[0]
+    if not core.take(s, ring, row):
         return False
-    _navigate(state, out)
+    _navigate(s, ring, out)
     return True
 
 
 @compiled
-def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
-    """Take all rows; see :class:`..contract.RowKernel`."""
+def run(state: Any, ring: Any, rows: FloatArray, out: FloatArray) -> int:
+    """Take all rows; a row without a result is NaN. Return the number of results."""
     results = 0
     for i in range(rows.shape[0]):
-        if kernel(state, rows[i], out[i]):
+        if kernel(state, ring, rows[i], out[i]):
             results += 1
         else:
-            out[i, :] = float("nan")
+            out[i, :] = math.nan
     return results
 
 
 @compiled
-def flush(state: FloatArray, out: FloatArray) -> int:
+def flush(state: Any, ring: Any, out: FloatArray) -> int:
     """Fill ``out`` with the results still held back, return their number."""
+    s = state[0]
     results = 0
-    while results < out.shape[0] and foot.take_end(state):
-        _navigate(state, out[results])
+    while results < out.shape[0] and core.take_end(s, ring):
+        _navigate(s, ring, out[results])
         results += 1
     return results
 
 
-class Foot9IezKf(foot.FootEstimator):
+class Foot9IezKf(FootEstimator):
     """Position and velocity of the nine-state filter, orientation of a Kalman filter with gyroscope biases.
 
     Source: foot-navigation dissertation, section 3.6.2: the gyroscope predicts, the accelerometer corrects
@@ -197,21 +197,21 @@ class Foot9IezKf(foot.FootEstimator):
     name: ClassVar[str] = "foot.9iez-kf"
     title: ClassVar[str] = "9 states, zero-velocity updates, orientation by its own Kalman filter"
     source: ClassVar[str] = "foot-navigation dissertation, section 3.6.2"
-    Params = Foot9IezKfParams
+    Params = Foot9IezKfAllParams
     presets: ClassVar[dict[str, dict[str, Any]]] = base.PRESETS
-    state_size: ClassVar[int] = SIZE
+    RECORD = RECORD
     kernel = staticmethod(kernel)
     run = staticmethod(run)
     flush_kernel = staticmethod(flush)
 
-    def configure(self, params: Any) -> None:
+    def configure(self, record: Any, params: Any) -> None:
         """Write the noise variances, the gates and the initial covariance into the state."""
-        base.configure(self.state, params)
-        self.state[FEEDBACK] = params.zupt_turns
-        s = self.state
-        s[Q_TURN], s[Q_BIAS] = params.sigma_turn**2, params.sigma_gyr_walk**2
-        s[R_LEVEL], s[LEVEL_GATE] = params.sigma_level**2, params.level_gate
-        s[R_ZARU] = params.sigma_zaru**2
-        s[ZARU_AFTER], s[ZARU_RATE] = params.zaru_after_s, params.zaru_gyr_max
-        for i in range(3):
-            s[P + (BIAS + i) * (M + 1)] = params.sigma_gyr_bias0**2
+        base.configure(record, params)
+        record.zupt_turns = params.zupt_turns
+        o = record.orientation
+        o.q_turn, o.q_bias = params.sigma_turn**2, params.sigma_gyr_walk**2
+        o.r_level, o.level_gate = params.sigma_level**2, params.level_gate
+        o.r_zaru = params.sigma_zaru**2
+        o.zaru_after, o.zaru_rate = params.zaru_after_s, params.zaru_gyr_max
+        for i in range(BIAS, BIAS + 3):
+            o.P[i, i] = params.sigma_gyr_bias0**2

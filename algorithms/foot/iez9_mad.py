@@ -6,29 +6,23 @@ import math
 from typing import Annotated, Any, ClassVar
 
 from ..contract import FloatArray
+from ..numerics import strapdown
 from ..numerics.compiled import compiled, inlined
-from ..numerics.rotations import quat_from_rot, rot_from_quat
+from ..numerics.records import record_type
+from ..numerics.rotations import quat_of, set_quat
 from ..parameters import meta
-from . import common as foot
+from . import core
 from . import iez9 as base
-from . import layout as la
-from . import strapdown
-from .layout import (
-    ACC_N,
-    BIAS_GYR,
-    R_ACC,
-    R_DT,
-    R_GYR,
-    R_STILL,
-    ROT,
-    STARTED,
-)
+from .estimator import FootEstimator
+from .parameters import with_parts
 
-_take = la.Allocator(base.SIZE)
-FEEDBACK = _take()
-BETA = _take()
-QUAT = _take(4)
-SIZE = _take.size
+RECORD = record_type(
+    *base.FILTER,
+    ("zupt_turns", "?"),
+    ("beta", "f8"),
+    ("quat", "f8", (4,)),  # wxyz, rot_nb
+    *core.CORE,
+)
 
 
 class Foot9IezMadParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -52,10 +46,12 @@ class Foot9IezMadParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=
     ] = False
 
 
+Foot9IezMadAllParams = with_parts(Foot9IezMadParams, "Foot9IezMadAllParams", __name__)
+
+
 @inlined
 def madgwick(
-    s: FloatArray,
-    q: int,
+    q: FloatArray,
     ax: float,
     ay: float,
     az: float,
@@ -65,13 +61,13 @@ def madgwick(
     dt: float,
     beta: float,
 ) -> None:
-    """Carry the quaternion (wxyz, rot_nb) at ``s[q:q+4]`` over ``dt``: Madgwick 2010, eqs 11–13, 20–21,
+    """Carry the quaternion (wxyz, rot_nb) ``q`` over ``dt``: Madgwick 2010, eqs 11–13, 20–21,
     25–34 (IMU).
 
     ``a`` is the specific force in any unit, ``w`` the angular rate in rad/s. A force of norm zero is left
     out.
     """
-    a, b, c, d = s[q], s[q + 1], s[q + 2], s[q + 3]
+    a, b, c, d = q[0], q[1], q[2], q[3]
     da = 0.5 * (-b * wx - c * wy - d * wz)
     db = 0.5 * (a * wx + c * wz - d * wy)
     dc = 0.5 * (a * wy - b * wz + d * wx)
@@ -97,80 +93,78 @@ def madgwick(
     c += dc * dt
     d += dd * dt
     norm = math.sqrt(a * a + b * b + c * c + d * d)
-    s[q], s[q + 1], s[q + 2], s[q + 3] = a / norm, b / norm, c / norm, d / norm
+    q[0], q[1], q[2], q[3] = a / norm, b / norm, c / norm, d / norm
 
 
 @inlined
-def _advance(s: FloatArray, r: int) -> None:
+def _advance(s: Any, r: Any) -> None:
     strapdown.resolve(s, r)
-    x, y, z = s[ACC_N], s[ACC_N + 1], s[ACC_N + 2]
-    madgwick(
-        s,
-        QUAT,
-        s[r + R_ACC],
-        s[r + R_ACC + 1],
-        s[r + R_ACC + 2],
-        s[r + R_GYR] - s[BIAS_GYR],
-        s[r + R_GYR + 1] - s[BIAS_GYR + 1],
-        s[r + R_GYR + 2] - s[BIAS_GYR + 2],
-        s[r + R_DT],
-        s[BETA],
-    )
-    rot_from_quat(s, QUAT, s, ROT)
+    x, y, z = s.force[0], s.force[1], s.force[2]
+    wx, wy, wz = r.gyr[0] - s.bias_gyr[0], r.gyr[1] - s.bias_gyr[1], r.gyr[2] - s.bias_gyr[2]
+    madgwick(s.quat, r.acc[0], r.acc[1], r.acc[2], wx, wy, wz, r.dt, s.beta)
+    set_quat(s.rot, s.quat[0], s.quat[1], s.quat[2], s.quat[3])
     strapdown.resolve(s, r)
     strapdown.average_force(s, x, y, z)
-    strapdown.move(s, s[r + R_DT])
+    strapdown.move(s, r.dt)
+
+
+@inlined
+def _take_over(s: Any) -> None:
+    """Set the quaternion to the rotation."""
+    s.quat[0], s.quat[1], s.quat[2], s.quat[3] = quat_of(s.rot)
 
 
 @compiled
-def _navigate(s: FloatArray, out: FloatArray) -> None:
-    r = foot.release(s)
-    if foot.starts(s):
-        quat_from_rot(s, ROT, s, QUAT)
-    elif s[STARTED] > 0.5:
+def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
+    r = core.release(s, ring)
+    if core.starts(s):
+        _take_over(s)
+    elif s.started:
         _advance(s, r)
-        base.predict(s, s[r + R_DT])
-        if s[r + R_STILL] > 0.5:
-            base.zero_velocity(s, 0 if s[FEEDBACK] > 0.5 else 3)
-            if s[FEEDBACK] > 0.5:
-                quat_from_rot(s, ROT, s, QUAT)
-    foot.emit(s, r, out)
-    foot.emit_sigma(s, base.P, base.N, base.XPOS, base.XVEL, base.ATT, out)
-    foot.emit_detector(s, r, base.FIRST_DETECTOR, out)
+        base.predict(s, r.dt)
+        if r.still:
+            base.zero_velocity(s, 0 if s.zupt_turns else base.POS)
+            if s.zupt_turns:
+                _take_over(s)
+    core.emit(s, r, out)
+    core.emit_sigma(s, base.POS, base.VEL, base.ATT, out)
+    core.emit_detector(r, core.AFTER_SIGMA, out)
 
 
 @compiled
-def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
+def kernel(state: Any, ring: Any, row: FloatArray, out: FloatArray) -> bool:
     """Take one row; fill ``out`` and return True where a result is due."""
-    if not foot.take(state, row):
+    s = state[0]
+    if not core.take(s, ring, row):
         return False
-    _navigate(state, out)
+    _navigate(s, ring, out)
     return True
 
 
 @compiled
-def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
-    """Take all rows; see :class:`..contract.RowKernel`."""
+def run(state: Any, ring: Any, rows: FloatArray, out: FloatArray) -> int:
+    """Take all rows; a row without a result is NaN. Return the number of results."""
     results = 0
     for i in range(rows.shape[0]):
-        if kernel(state, rows[i], out[i]):
+        if kernel(state, ring, rows[i], out[i]):
             results += 1
         else:
-            out[i, :] = float("nan")
+            out[i, :] = math.nan
     return results
 
 
 @compiled
-def flush(state: FloatArray, out: FloatArray) -> int:
+def flush(state: Any, ring: Any, out: FloatArray) -> int:
     """Fill ``out`` with the results still held back, return their number."""
+    s = state[0]
     results = 0
-    while results < out.shape[0] and foot.take_end(state):
-        _navigate(state, out[results])
+    while results < out.shape[0] and core.take_end(s, ring):
+        _navigate(s, ring, out[results])
         results += 1
     return results
 
 
-class Foot9IezMad(foot.FootEstimator):
+class Foot9IezMad(FootEstimator):
     """Position and velocity of the nine-state filter, orientation of Madgwick's gradient filter for IMU.
 
     Source: foot-navigation dissertation, eq 3.18 and section 3.6; Madgwick (2010), "An efficient orientation
@@ -185,15 +179,14 @@ class Foot9IezMad(foot.FootEstimator):
     name: ClassVar[str] = "foot.9iez-mad"
     title: ClassVar[str] = "9 states, zero-velocity updates, orientation by Madgwick"
     source: ClassVar[str] = "foot-navigation dissertation, eq 3.18; Madgwick 2010"
-    Params = Foot9IezMadParams
+    Params = Foot9IezMadAllParams
     presets: ClassVar[dict[str, dict[str, Any]]] = base.PRESETS
-    state_size: ClassVar[int] = SIZE
+    RECORD = RECORD
     kernel = staticmethod(kernel)
     run = staticmethod(run)
     flush_kernel = staticmethod(flush)
 
-    def configure(self, params: Any) -> None:
+    def configure(self, record: Any, params: Any) -> None:
         """Write the noise variances and the gain into the state."""
-        base.configure(self.state, params)
-        self.state[FEEDBACK] = params.zupt_turns
-        self.state[BETA] = params.beta
+        base.configure(record, params)
+        record.zupt_turns, record.beta = params.zupt_turns, params.beta

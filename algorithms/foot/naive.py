@@ -2,65 +2,74 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+import math
+from typing import Any, ClassVar
 
 from ..contract import FloatArray
+from ..numerics import strapdown
 from ..numerics.compiled import compiled
-from . import common as foot
-from . import strapdown
-from .layout import O_REST, STARTED
+from ..numerics.records import record_type
+from . import core
+from .estimator import FootEstimator
+from .parameters import FootParams, with_parts
+
+FootNaiveParams = with_parts(FootParams, "FootNaiveParams", __name__)
 
 
 @compiled
-def _navigate(s: FloatArray, out: FloatArray) -> None:
-    r = foot.release(s)
-    if not foot.starts(s) and s[STARTED] > 0.5:
+def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
+    r = core.release(s, ring)
+    if not core.starts(s) and s.started:
         strapdown.advance(s, r)
-    foot.emit(s, r, out)
-    foot.emit_detector(s, r, O_REST, out)
+    core.emit(s, r, out)
+    core.emit_detector(r, core.SIGMA, out)
 
 
 @compiled
-def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
+def kernel(state: Any, ring: Any, row: FloatArray, out: FloatArray) -> bool:
     """Take one row; fill ``out`` and return True where a result is due."""
-    if not foot.take(state, row):
+    s = state[0]
+    if not core.take(s, ring, row):
         return False
-    _navigate(state, out)
+    _navigate(s, ring, out)
     return True
 
 
 @compiled
-def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
-    """Take all rows; see :class:`..contract.RowKernel`."""
+def run(state: Any, ring: Any, rows: FloatArray, out: FloatArray) -> int:
+    """Take all rows; a row without a result is NaN. Return the number of results."""
     results = 0
     for i in range(rows.shape[0]):
-        if kernel(state, rows[i], out[i]):
+        if kernel(state, ring, rows[i], out[i]):
             results += 1
         else:
-            out[i, :] = float("nan")
+            out[i, :] = math.nan
     return results
 
 
 @compiled
-def flush(state: FloatArray, out: FloatArray) -> int:
+def flush(state: Any, ring: Any, out: FloatArray) -> int:
     """Fill ``out`` with the results still held back, return their number."""
+    s = state[0]
     results = 0
-    while results < out.shape[0] and foot.take_end(state):
-        _navigate(state, out[results])
+    while results < out.shape[0] and core.take_end(s, ring):
+        _navigate(s, ring, out[results])
         results += 1
     return results
 
 
-class FootNaive(foot.FootEstimator):
+class FootNaive(FootEstimator):
     """Strapdown mechanization from the rest at the start, never corrected; the detector only watches.
 
-    Source: foot-navigation dissertation, eqs 3.19–3.27 (see :mod:`.strapdown`); the default is the authors'
-    program (trapezoids), ``integration="euler"`` is the text.
+    Source: foot-navigation dissertation, eqs 3.19–3.27 (see :mod:`..numerics.strapdown`); the default is the
+    authors' program (trapezoids), ``integration="euler"`` is the text.
     """
 
     name: ClassVar[str] = "foot.naive"
     title: ClassVar[str] = "strapdown without correction"
     source: ClassVar[str] = "foot-navigation dissertation, eqs 3.19–3.27"
+    Params = FootNaiveParams
+    RECORD = record_type(*core.CORE)
     has_sigma: ClassVar[bool] = False
     kernel = staticmethod(kernel)
     run = staticmethod(run)

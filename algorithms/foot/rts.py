@@ -6,233 +6,222 @@ import math
 from typing import Any, ClassVar
 
 import numpy as np
-from numba import njit
+from numpy.typing import NDArray
 
 from ..contract import AlgorithmError, FloatArray
-from ..numerics import kalman
+from ..numerics import kalman, strapdown
 from ..numerics.compiled import compiled
-from ..numerics.rotations import quat_from_rot, rot_from_quat, turn_nav
-from . import common as foot
+from ..numerics.records import kernel_view, record_type
+from ..numerics.rotations import quat_of, set_quat, turn_nav
+from . import core
 from . import iez15_zaru as base
-from . import layout as la
-from . import strapdown
-from .iez15_zaru import (
-    ATT,
-    BACC,
-    BGYR,
-    DX,
-    WORK,
-    XPOS,
-    XVEL,
-    N,
-    P,
-)
-from .layout import (
-    ACC_N,
-    BIAS_GYR,
-    O_POSE,
-    O_REST,
-    O_STILL,
-    O_VEL,
-    POS,
-    R_DT,
-    R_GYR,
-    R_STILL,
-    ROT,
-    STARTED,
-    STEP_WAS_STILL,
-    TAKEN,
-    VEL,
-)
+from .estimator import FootEstimator
+from .iez15_zaru import ATT, BIAS_ACC, BIAS_GYR, POS, VEL, N
+from .parameters import with_parts
 
 SEGMENT = 4096
 """Samples whose covariances are held at once; the forward pass is run again segment by segment, backwards."""
 
-# What the backward pass must know of a sample
-_take = la.Allocator()
-L_ACTIVE = _take()  # 0 not started, 1 the start itself, 2 navigated
-L_DT = _take()
-L_FORCE = _take(3)
-L_ROT_PRIOR = _take(9)  # rot_nb at the prediction
-L_UPDATES = _take()
-L_UPDATE = _take(6 * (3 + N))  # each: error state, innovation, its variance, gain
-L_P = _take(N * N)  # covariance after the updates
-LOG = _take.size
+NOT_STARTED, START, NAVIGATED = 0, 1, 2
+MOST_UPDATES = 6
+
+LOG = record_type(
+    ("stage", "i8"),
+    ("dt", "f8"),
+    ("force", "f8", (3,)),
+    ("rot", "f8", (3, 3)),  # rot_nb at the prediction
+    ("n_updates", "i8"),
+    ("index", "i8", (MOST_UPDATES,)),  # error state that each update measured
+    ("residual", "f8", (MOST_UPDATES,)),
+    ("variance", "f8", (MOST_UPDATES,)),  # of the innovation
+    ("gain", "f8", (MOST_UPDATES, N)),
+    ("P", "f8", (N, N)),  # covariance after the updates
+)
+"""What the backward pass must know of a sample."""
+
+FootRtsParams = with_parts(base.Foot15IezZaruParams, "FootRtsParams", __name__)
 
 
 @compiled
-def _update(s: FloatArray, log: FloatArray, index: int, seen: float, variance: float) -> None:
-    at = L_UPDATE + int(log[L_UPDATES]) * (3 + N)
-    log[L_UPDATES] += 1.0
-    log[at] = index
-    log[at + 1] = seen - s[DX + index]
-    log[at + 2] = s[P + index * (N + 1)] + variance
-    kalman.update(s, P, N, DX, WORK, index, seen, variance, 0)
+def _update(s: Any, log: Any, index: int, error: float, variance: float) -> None:
+    k = log.n_updates
+    log.n_updates += 1
+    log.index[k] = index
+    log.residual[k] = error - s.dx[index]
+    log.variance[k] = s.P[index, index] + variance
+    kalman.update(s, index, error, variance, 0)
     for i in range(N):
-        log[at + 3 + i] = s[WORK + i]
+        log.gain[k, i] = s.gain[i]
 
 
 @compiled
-def _correct(s: FloatArray, r: int, log: FloatArray) -> None:
-    """Do what :func:`.foot_15iez_zaru.correct` does, and note every update."""
-    kalman.clear(s, DX, N)
+def _correct(s: Any, r: Any, log: Any) -> None:
+    """Do what :func:`.iez15_zaru.correct` does, and note every update."""
+    kalman.clear(s.dx)
     for i in range(3):
-        _update(s, log, XVEL + i, s[VEL + i], s[base.R_VEL])
-    if foot.at_rest(s, r, s[base.ZARU_AFTER], s[base.ZARU_RATE]):
+        _update(s, log, VEL + i, s.vel[i], s.r_vel)
+    if core.at_rest(s, r, s.zaru_after, s.zaru_rate):
         for i in range(3):
-            _update(s, log, BGYR + i, s[BIAS_GYR + i] - s[r + R_GYR + i], s[base.R_ZARU])
+            _update(s, log, BIAS_GYR + i, s.bias_gyr[i] - r.gyr[i], s.r_zaru)
     base.feed_back(s)
 
 
 @compiled
-def _navigate(s: FloatArray, out: FloatArray, log: FloatArray) -> None:
-    r = foot.release(s)
-    log[L_ACTIVE] = 0.0
-    log[L_UPDATES] = 0.0
-    if foot.starts(s):
-        log[L_ACTIVE] = 1.0
-    elif s[STARTED] > 0.5:
-        log[L_ACTIVE] = 2.0
+def _navigate(s: Any, ring: Any, out: FloatArray, log: Any) -> None:
+    r = core.release(s, ring)
+    log.stage = NOT_STARTED
+    log.n_updates = 0
+    if core.starts(s):
+        log.stage = START
+    elif s.started:
+        log.stage = NAVIGATED
         strapdown.advance(s, r)
-        log[L_DT] = s[r + R_DT]
+        log.dt = r.dt
         for i in range(3):
-            log[L_FORCE + i] = s[ACC_N + i]
-        for i in range(9):
-            log[L_ROT_PRIOR + i] = s[ROT + i]
-        base.predict(s, s[r + R_DT])
-        if s[r + R_STILL] > 0.5:
+            log.force[i] = s.force[i]
+            for j in range(3):
+                log.rot[i, j] = s.rot[i, j]
+        base.predict(s, r.dt)
+        if r.still:
             _correct(s, r, log)
-    for i in range(N * N):
-        log[L_P + i] = s[P + i]
-    foot.emit(s, r, out)
-    foot.emit_sigma(s, P, N, XPOS, XVEL, ATT, out)
-    foot.emit_detector(s, r, base.base.FIRST_DETECTOR, out)
+    for i in range(N):
+        for j in range(N):
+            log.P[i, j] = s.P[i, j]
+    core.emit(s, r, out)
+    core.emit_sigma(s, POS, VEL, ATT, out)
+    core.emit_detector(r, core.AFTER_SIGMA, out)
 
 
 @compiled
-def forward(s: FloatArray, rows: FloatArray, out: FloatArray, logs: FloatArray) -> int:
+def forward(state: Any, ring: Any, rows: FloatArray, out: FloatArray, logs: Any) -> int:
     """Filter until ``out`` is full or the rows have ended; note each sample in ``logs``; return how many."""
+    s = state[0]
     done = 0
     while done < out.shape[0]:
-        k = int(s[TAKEN])
+        k = s.taken
         if k < rows.shape[0]:
-            if not foot.take(s, rows[k]):
+            if not core.take(s, ring, rows[k]):
                 continue
-        elif not foot.take_end(s):
+        elif not core.take_end(s, ring):
             break
-        _navigate(s, out[done], logs[done])
+        _navigate(s, ring, out[done], logs[done])
         done += 1
     return done
 
 
 @compiled
-def _step_back(a: FloatArray, at: int, stride: int, log: FloatArray) -> None:
-    """Multiply the vector at ``a[at + i stride]`` by Fᵀ of the sample in ``log``, in place."""
-    dt = log[L_DT]
-    x, y, z = log[L_FORCE] * dt, log[L_FORCE + 1] * dt, log[L_FORCE + 2] * dt
-    att, vel = at + ATT * stride, at + XVEL * stride
-    pos, bgyr, bacc = at + XPOS * stride, at + BGYR * stride, at + BACC * stride
-    u, v, w = a[vel], a[vel + stride], a[vel + 2 * stride]
+def _step_back(a: FloatArray, log: Any) -> None:
+    """Multiply the vector ``a`` (n) by Fᵀ of the sample in ``log``, in place."""
+    dt = log.dt
+    x, y, z = log.force[0] * dt, log.force[1] * dt, log.force[2] * dt
+    u, v, w = a[VEL], a[VEL + 1], a[VEL + 2]
     for i in range(3):
         turned, pushed = 0.0, 0.0
         for j in range(3):
-            turned += log[L_ROT_PRIOR + 3 * j + i] * a[att + j * stride]
-            pushed += log[L_ROT_PRIOR + 3 * j + i] * a[vel + j * stride]
-        a[bgyr + i * stride] -= dt * turned
-        a[bacc + i * stride] -= dt * pushed
+            turned += log.rot[j, i] * a[ATT + j]
+            pushed += log.rot[j, i] * a[VEL + j]
+        a[BIAS_GYR + i] -= dt * turned
+        a[BIAS_ACC + i] -= dt * pushed
     for i in range(3):
-        a[vel + i * stride] += dt * a[pos + i * stride]
-    a[att] += y * w - z * v
-    a[att + stride] += z * u - x * w
-    a[att + 2 * stride] += x * v - y * u
+        a[VEL + i] += dt * a[POS + i]
+    a[ATT] += y * w - z * v
+    a[ATT + 1] += z * u - x * w
+    a[ATT + 2] += x * v - y * u
 
 
-@njit(cache=True, nogil=True)
-def backward(logs: FloatArray, out: FloatArray, adjoint: FloatArray, information: FloatArray) -> None:
+@compiled
+def backward(
+    logs: Any,
+    out: FloatArray,
+    adjoint: FloatArray,
+    information: FloatArray,
+    gain: FloatArray,
+    shift: FloatArray,
+    left: FloatArray,
+    rot: FloatArray,
+) -> None:
     """Smooth the samples of ``logs`` and write them over the filter's pose, velocity and sigma in ``out``.
 
-    ``adjoint`` (15) and ``information`` (225) are λ and Λ of Bierman 1973, zero at the end of the walk, and
-    are carried from segment to segment.
+    ``adjoint`` (n) and ``information`` (n, n) are λ and Λ of Bierman 1973, zero at the end of the walk, and
+    are carried from segment to segment; the last four are work space: (n), (n), (n, n), (3, 3).
     """
-    gain = np.empty(N)
-    shift = np.empty(N)
-    left = np.empty(N * N)
-    rot = np.empty(9)
     for k in range(logs.shape[0] - 1, -1, -1):
         log = logs[k]
-        if log[L_ACTIVE] == 0.0:
+        if log.stage == NOT_STARTED:
             continue
         for i in range(N):
             shift[i] = 0.0
             for j in range(N):
-                shift[i] -= log[L_P + i * N + j] * adjoint[j]
-        rot_from_quat(out[k], O_POSE + 3, rot, 0)
-        turn_nav(rot, 0, shift[ATT], shift[ATT + 1], shift[ATT + 2])
-        quat_from_rot(rot, 0, out[k], O_POSE + 3)
+                shift[i] -= log.P[i, j] * adjoint[j]
+        q = core.POSE + 3
+        set_quat(rot, out[k, q], out[k, q + 1], out[k, q + 2], out[k, q + 3])
+        turn_nav(rot, shift[ATT], shift[ATT + 1], shift[ATT + 2])
+        out[k, q], out[k, q + 1], out[k, q + 2], out[k, q + 3] = quat_of(rot)
         for i in range(3):
-            out[k, O_POSE + i] += shift[XPOS + i]
-            out[k, O_VEL + i] += shift[XVEL + i]
+            out[k, core.POSE + i] += shift[POS + i]
+            out[k, core.VELOCITY + i] += shift[VEL + i]
         for i in range(N):
             for j in range(N):
                 total = 0.0
                 for m in range(N):
-                    total += log[L_P + i * N + m] * information[m * N + j]
-                left[i * N + j] = total
+                    total += log.P[i, m] * information[m, j]
+                left[i, j] = total
         for block in range(3):
-            first = XPOS if block == 0 else XVEL if block == 1 else ATT
+            first = POS if block == 0 else VEL if block == 1 else ATT
             for i in range(first, first + 3):
-                variance = log[L_P + i * (N + 1)]
+                variance = log.P[i, i]
                 for m in range(N):
-                    variance -= left[i * N + m] * log[L_P + m * N + i]
-                out[k, O_REST + 3 * block + i - first] = math.sqrt(max(0.0, variance))
-        for u in range(int(log[L_UPDATES]) - 1, -1, -1):
-            at = L_UPDATE + u * (3 + N)
-            index = int(log[at])
-            seen = log[at + 1] / log[at + 2]
+                    variance -= left[i, m] * log.P[m, i]
+                out[k, core.SIGMA + 3 * block + i - first] = math.sqrt(max(0.0, variance))
+        for u in range(log.n_updates - 1, -1, -1):
+            index = log.index[u]
+            residual = log.residual[u] / log.variance[u]
             for i in range(N):
-                gain[i] = log[at + 3 + i]
-                seen -= gain[i] * adjoint[i]
-            adjoint[index] += seen
-            # Λ ← (I − K hᵀ)ᵀ Λ (I − K hᵀ) + h hᵀ / total, h = e_index
+                gain[i] = log.gain[u, i]
+                residual -= gain[i] * adjoint[i]
+            adjoint[index] += residual
+            # Λ ← (I − K hᵀ)ᵀ Λ (I − K hᵀ) + h hᵀ / variance, h = e_index
             square = 0.0
             for i in range(N):
-                left[i] = 0.0
+                shift[i] = 0.0
                 for j in range(N):
-                    left[i] += information[i * N + j] * gain[j]
+                    shift[i] += information[i, j] * gain[j]
             for i in range(N):
-                square += gain[i] * left[i]
+                square += gain[i] * shift[i]
             for i in range(N):
-                information[i * N + index] -= left[i]
-                information[index * N + i] -= left[i]
-            information[index * (N + 1)] += square + 1.0 / log[at + 2]
-        if log[L_ACTIVE] > 1.5:
-            _step_back(adjoint, 0, 1, log)
+                information[i, index] -= shift[i]
+                information[index, i] -= shift[i]
+            information[index, index] += square + 1.0 / log.variance[u]
+        if log.stage == NAVIGATED:
+            _step_back(adjoint, log)
             for j in range(N):
-                _step_back(information, j, N, log)
+                _step_back(information[:, j], log)
             for i in range(N):
-                _step_back(information, i * N, 1, log)
+                _step_back(information[i], log)
 
 
 @compiled
-def steps_again(s: FloatArray, rows: FloatArray, out: FloatArray) -> None:
-    """Find the steps anew on the smoothed track; ``s`` is a fresh state."""
-    r = int(s[la.RING])
+def steps_again(state: Any, ring: Any, rows: FloatArray, out: FloatArray) -> None:
+    """Find the steps anew on the smoothed track; ``state`` is a fresh one."""
+    s = state[0]
+    r = ring[0]
     for k in range(rows.shape[0]):
-        if not math.isfinite(out[k, O_POSE]):
+        if not math.isfinite(out[k, core.POSE]):
             continue
-        if s[STARTED] < 0.5:
-            s[STARTED] = 1.0
-            s[STEP_WAS_STILL] = 1.0
-        s[r + R_DT] = rows[k, 0]
-        s[r + R_STILL] = out[k, O_STILL]
+        if not s.started:
+            s.started = True
+            s.steps.was_still = True
+        r.dt = rows[k, 0]
+        r.still = out[k, core.STILL] > 0.5
         for i in range(3):
-            s[POS + i] = out[k, O_POSE + i]
-            s[VEL + i] = out[k, O_VEL + i]
-        rot_from_quat(out[k], O_POSE + 3, s, ROT)
-        foot.emit(s, r, out[k])
+            s.pos[i] = out[k, core.POSE + i]
+            s.vel[i] = out[k, core.VELOCITY + i]
+        q = core.POSE + 3
+        set_quat(s.rot, out[k, q], out[k, q + 1], out[k, q + 2], out[k, q + 3])
+        core.emit(s, r, out[k])
 
 
-class FootRts(foot.FootEstimator):
+class FootRts(FootEstimator):
     """Fixed-interval smoother over ``foot.15iez-zaru``: offline, for records, not for live use.
 
     Source: the Rauch–Tung–Striebel smoother (1965) in the form of Bierman 1973, "Fixed interval smoothing
@@ -249,18 +238,18 @@ class FootRts(foot.FootEstimator):
     title: ClassVar[str] = "offline smoother (RTS) over the 15-state filter"
     source: ClassVar[str] = "Rauch, Tung, Striebel 1965; Bierman 1973; Colomar et al. 2012"
     offline: ClassVar[bool] = True
-    Params = base.Foot15IezZaruParams
+    Params = FootRtsParams
     presets: ClassVar[dict[str, dict[str, Any]]] = base.Foot15IezZaru.presets
-    state_size: ClassVar[int] = base.SIZE
+    RECORD = base.RECORD
 
     def __init__(self, params: Any = None) -> None:
         super().__init__(params)
         self._fresh = self.state.copy()
         self.latency = 0  # everything is known at once, at the end
 
-    def configure(self, params: Any) -> None:
+    def configure(self, record: Any, params: Any) -> None:
         """Write the constants of ``foot.15iez-zaru`` into the state."""
-        base.Foot15IezZaru.configure(self, params)  # type: ignore[arg-type]
+        base.configure(record, params)
 
     def step(self, row: FloatArray) -> FloatArray | None:
         """Refuse: a smoother needs the whole recording."""
@@ -288,17 +277,20 @@ class FootRts(foot.FootEstimator):
         rows = np.ascontiguousarray(rows, dtype=np.float64)
         n = len(rows)
         out = np.empty((n, self.width))
-        logs = np.zeros((min(segment, max(n, 1)), LOG))
+        logs = kernel_view(
+            np.zeros(min(segment, max(n, 1)) * LOG.itemsize, np.uint8), LOG, 0, min(segment, max(n, 1))
+        )
         state = self._fresh.copy()
-        kept: list[FloatArray] = []
+        kept: list[NDArray[np.uint8]] = []
         for first in range(0, n, segment):
             kept.append(state.copy())
-            forward(state, rows, out[first : first + segment], logs)
+            forward(*self.views(state), rows, out[first : first + segment], logs)
         self.state[:] = state
-        adjoint, information = np.zeros(N), np.zeros(N * N)
+        work = np.zeros(N), np.zeros(N), np.zeros((N, N)), np.zeros((3, 3))
+        adjoint, information = np.zeros(N), np.zeros((N, N))
         for first, snapshot in zip(range(0, n, segment)[::-1], kept[::-1], strict=True):
             piece = out[first : first + segment]
-            count = forward(snapshot, rows, piece, logs)
-            backward(logs[:count], piece, adjoint, information)
-        steps_again(self._fresh.copy(), rows, out)
+            count = forward(*self.views(snapshot), rows, piece, logs)
+            backward(logs[:count], piece, adjoint, information, *work)
+        steps_again(*self.views(self._fresh.copy()), rows, out)
         return out

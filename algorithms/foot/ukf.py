@@ -6,42 +6,29 @@ import math
 from typing import Annotated, Any, ClassVar
 
 from ..contract import FloatArray
-from ..numerics import kalman
+from ..numerics import kalman, strapdown
 from ..numerics.compiled import compiled
+from ..numerics.records import record_type
 from ..parameters import meta
-from . import common as foot
+from . import core
 from . import iez9 as base
-from . import layout as la
-from . import strapdown
-from .iez9 import (
-    ATT,
-    XPOS,
-    XVEL,
-    N,
-    P,
-)
-from .layout import (
-    ACC_OLD,
-    GRAVITY,
-    POS,
-    R_DT,
-    R_STILL,
-    STARTED,
-    TRAPEZOID,
-    VEL,
-)
+from .estimator import FootEstimator
+from .iez9 import ATT, POS, VEL, N
+from .parameters import with_parts
 
 POINTS = 2 * N + 1
 
-_take = la.Allocator(base.SIZE)
-SPREAD = _take()  # √(n + λ)
-W_CENTRE_COV = _take()
-W_OTHER = _take()
-FORCE = _take(3)  # specific force in n that acts over the step
-ROOT = _take(N * N)
-DEVIATION = _take(POINTS * N)
-MEAN = _take(N)
-SIZE = _take.size
+RECORD = record_type(
+    *base.FILTER,
+    ("spread", "f8"),  # √(n + λ)
+    ("w_centre", "f8"),  # weight of the centre in the covariance
+    ("w_other", "f8"),  # weight of every other point
+    ("step_force", "f8", (3,)),  # specific force in n that acts over the step
+    ("root", "f8", (N, N)),
+    ("deviation", "f8", (POINTS, N)),  # sigma points about the nominal navigation
+    ("centre", "f8", (N,)),  # their mean
+    *core.CORE,
+)
 
 
 class FootUkfParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -65,46 +52,51 @@ class FootUkfParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=True
     ] = 0.0
 
 
+FootUkfAllParams = with_parts(FootUkfParams, "FootUkfAllParams", __name__)
+
+
 @compiled
-def semidefinite_root(s: FloatArray, p: int, root: int, n: int) -> None:
-    """Write the lower L with L Lᵀ = the n×n matrix at ``s[p]`` to ``s[root]``.
+def semidefinite_root(P: FloatArray, root: FloatArray) -> None:
+    """Write the lower L with L Lᵀ = ``P`` (n, n) to ``root``.
 
     Cholesky's columns, where a pivot within rounding of zero makes a column of zeros: P starts at zero.
     """
+    n = P.shape[0]
     greatest = 0.0
     for i in range(n):
-        greatest = max(greatest, s[p + i * (n + 1)])
-    kalman.clear(s, root, n * n)
+        greatest = max(greatest, P[i, i])
+        for j in range(n):
+            root[i, j] = 0.0
     for j in range(n):
-        pivot = s[p + j * (n + 1)]
+        pivot = P[j, j]
         for k in range(j):
-            pivot -= s[root + j * n + k] * s[root + j * n + k]
+            pivot -= root[j, k] * root[j, k]
         if pivot <= 1e-15 * greatest:
             continue
         pivot = math.sqrt(pivot)
-        s[root + j * n + j] = pivot
+        root[j, j] = pivot
         for i in range(j + 1, n):
-            value = s[p + i * n + j]
+            value = P[i, j]
             for k in range(j):
-                value -= s[root + i * n + k] * s[root + j * n + k]
-            s[root + i * n + j] = value / pivot
+                value -= root[i, k] * root[j, k]
+            root[i, j] = value / pivot
 
 
 @compiled
-def _spread(s: FloatArray, d: int, dt: float) -> None:
-    """Carry one deviation from the nominal navigation, at ``s[d]``, over the time step, without linearizing.
+def _spread(d: FloatArray, force: FloatArray, trapezoid: bool, dt: float) -> None:
+    """Carry one deviation from the nominal navigation, ``d``, over the time step, without linearizing.
 
     The attitude error turns about n-axes (true C = exp([−δφ]×) C) and the body's own turn multiplies from the
     other side: it stays as it is. The estimate's force is off by (I − exp([−δφ]×)) f_n, the rotation exact.
     """
-    x, y, z = s[d + ATT], s[d + ATT + 1], s[d + ATT + 2]
+    x, y, z = d[ATT], d[ATT + 1], d[ATT + 2]
     square = x * x + y * y + z * z
     if square < 1e-8:
         a, b = 1.0 - square / 6.0, 0.5 - square / 24.0
     else:
         angle = math.sqrt(square)
         a, b = math.sin(angle) / angle, (1.0 - math.cos(angle)) / square
-    u, v, w = s[FORCE], s[FORCE + 1], s[FORCE + 2]
+    u, v, w = force[0], force[1], force[2]
     cx, cy, cz = y * w - z * v, z * u - x * w, x * v - y * u
     for i in range(3):
         if i == 0:
@@ -113,102 +105,105 @@ def _spread(s: FloatArray, d: int, dt: float) -> None:
             change = a * cy - b * (z * cx - x * cz)
         else:
             change = a * cz - b * (x * cy - y * cx)
-        old = s[d + XVEL + i]
+        old = d[VEL + i]
         new = old + change * dt
-        s[d + XVEL + i] = new
-        s[d + XPOS + i] += (0.5 * (old + new) if s[TRAPEZOID] > 0.5 else new) * dt
+        d[VEL + i] = new
+        d[POS + i] += (0.5 * (old + new) if trapezoid else new) * dt
 
 
 @compiled
-def predict(s: FloatArray, dt: float) -> None:
+def predict(s: Any, dt: float) -> None:
     """Carry P, and the second-order part of the mean, over one time step by the unscented transform.
 
-    Runs after :func:`.strapdown.advance`, which has carried the nominal navigation; ``s[FORCE]`` is set.
+    Runs after :func:`.strapdown.advance`, which has carried the nominal navigation; ``s.step_force`` is set.
     Attitude deviations have no mean of their own, so only velocity and position move.
     """
-    semidefinite_root(s, P, ROOT, N)
-    kalman.clear(s, DEVIATION, N)
+    semidefinite_root(s.P, s.root)
+    d = s.deviation
+    for i in range(N):
+        d[0, i] = 0.0
     for k in range(N):
         for i in range(N):
-            value = s[SPREAD] * s[ROOT + i * N + k]
-            s[DEVIATION + (1 + k) * N + i] = value
-            s[DEVIATION + (1 + N + k) * N + i] = -value
+            value = s.spread * s.root[i, k]
+            d[1 + k, i] = value
+            d[1 + N + k, i] = -value
     for k in range(1, POINTS):
-        _spread(s, DEVIATION + k * N, dt)
+        _spread(d[k], s.step_force, s.trapezoid, dt)
     for i in range(N):
         total = 0.0
         for k in range(1, POINTS):
-            total += s[DEVIATION + k * N + i]
-        s[MEAN + i] = s[W_OTHER] * total
+            total += d[k, i]
+        s.centre[i] = s.w_other * total
     for i in range(N):
         for j in range(i, N):
-            total = s[W_CENTRE_COV] * s[MEAN + i] * s[MEAN + j]
+            total = s.w_centre * s.centre[i] * s.centre[j]
             for k in range(1, POINTS):
-                d = DEVIATION + k * N
-                total += s[W_OTHER] * (s[d + i] - s[MEAN + i]) * (s[d + j] - s[MEAN + j])
-            s[P + i * N + j] = total
+                total += s.w_other * (d[k, i] - s.centre[i]) * (d[k, j] - s.centre[j])
+            s.P[i, j] = total
     # Error = estimate − truth: the mean of the errors is what the estimate has too much.
     for i in range(3):
-        s[VEL + i] -= s[MEAN + XVEL + i]
-        s[POS + i] -= s[MEAN + XPOS + i]
-    kalman.add_noise(s, P, N, ATT, s[base.Q_GYR] * dt * dt)
-    kalman.add_noise(s, P, N, XVEL, s[base.Q_ACC] * dt * dt)
-    kalman.mirror(s, P, N)
+        s.vel[i] -= s.centre[VEL + i]
+        s.pos[i] -= s.centre[POS + i]
+    kalman.add_noise(s.P, ATT, s.q_gyr * dt * dt)
+    kalman.add_noise(s.P, VEL, s.q_acc * dt * dt)
+    kalman.mirror(s.P)
 
 
 @compiled
-def _navigate(s: FloatArray, out: FloatArray) -> None:
-    r = foot.release(s)
-    if not foot.starts(s) and s[STARTED] > 0.5:
+def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
+    r = core.release(s, ring)
+    if not core.starts(s) and s.started:
         for i in range(3):
-            s[FORCE + i] = s[ACC_OLD + i]
+            s.step_force[i] = s.acc_n[i]
         strapdown.advance(s, r)
         for i in range(3):
-            if s[TRAPEZOID] > 0.5:
-                s[FORCE + i] = 0.5 * (s[FORCE + i] + s[ACC_OLD + i])
+            if s.trapezoid:
+                s.step_force[i] = 0.5 * (s.step_force[i] + s.acc_n[i])
             else:
-                s[FORCE + i] = s[ACC_OLD + i]
-        s[FORCE + 2] += s[GRAVITY]
-        predict(s, s[r + R_DT])
-        if s[r + R_STILL] > 0.5:
+                s.step_force[i] = s.acc_n[i]
+        s.step_force[2] += s.gravity
+        predict(s, r.dt)
+        if r.still:
             base.zero_velocity(s, 0)
-    foot.emit(s, r, out)
-    foot.emit_sigma(s, P, N, XPOS, XVEL, ATT, out)
-    foot.emit_detector(s, r, base.FIRST_DETECTOR, out)
+    core.emit(s, r, out)
+    core.emit_sigma(s, POS, VEL, ATT, out)
+    core.emit_detector(r, core.AFTER_SIGMA, out)
 
 
 @compiled
-def kernel(state: FloatArray, row: FloatArray, out: FloatArray) -> bool:
+def kernel(state: Any, ring: Any, row: FloatArray, out: FloatArray) -> bool:
     """Take one row; fill ``out`` and return True where a result is due."""
-    if not foot.take(state, row):
+    s = state[0]
+    if not core.take(s, ring, row):
         return False
-    _navigate(state, out)
+    _navigate(s, ring, out)
     return True
 
 
 @compiled
-def run(state: FloatArray, rows: FloatArray, out: FloatArray) -> int:
-    """Take all rows; see :class:`..contract.RowKernel`."""
+def run(state: Any, ring: Any, rows: FloatArray, out: FloatArray) -> int:
+    """Take all rows; a row without a result is NaN. Return the number of results."""
     results = 0
     for i in range(rows.shape[0]):
-        if kernel(state, rows[i], out[i]):
+        if kernel(state, ring, rows[i], out[i]):
             results += 1
         else:
-            out[i, :] = float("nan")
+            out[i, :] = math.nan
     return results
 
 
 @compiled
-def flush(state: FloatArray, out: FloatArray) -> int:
+def flush(state: Any, ring: Any, out: FloatArray) -> int:
     """Fill ``out`` with the results still held back, return their number."""
+    s = state[0]
     results = 0
-    while results < out.shape[0] and foot.take_end(state):
-        _navigate(state, out[results])
+    while results < out.shape[0] and core.take_end(s, ring):
+        _navigate(s, ring, out[results])
         results += 1
     return results
 
 
-class FootUkf(foot.FootEstimator):
+class FootUkf(FootEstimator):
     """Unscented Kalman filter on the nine error states of ``foot.9iez``, with the same zero-velocity update.
 
     Source: Wan and van der Merwe 2000, "The unscented Kalman filter for nonlinear estimation", eqs 15–17,
@@ -224,19 +219,17 @@ class FootUkf(foot.FootEstimator):
     name: ClassVar[str] = "foot.ukf"
     title: ClassVar[str] = "unscented Kalman filter, 9 states, zero-velocity updates"
     source: ClassVar[str] = "Wan and van der Merwe 2000, eqs 15–17; Brossard et al. 2020"
-    Params = FootUkfParams
+    Params = FootUkfAllParams
     presets: ClassVar[dict[str, dict[str, Any]]] = base.PRESETS
-    state_size: ClassVar[int] = SIZE
+    RECORD = RECORD
     kernel = staticmethod(kernel)
     run = staticmethod(run)
     flush_kernel = staticmethod(flush)
 
-    def configure(self, params: Any) -> None:
+    def configure(self, record: Any, params: Any) -> None:
         """Write noise variances and the weights of the sigma points into the state."""
-        s = self.state
-        s[base.Q_GYR], s[base.Q_ACC] = params.sigma_gyr**2, params.sigma_acc**2
-        s[base.R_VEL] = params.sigma_zupt**2
+        base.configure(record, params)
         scale = params.alpha**2 * (N + params.kappa)
-        s[SPREAD] = math.sqrt(scale)
-        s[W_CENTRE_COV] = 1.0 - N / scale + 1.0 - params.alpha**2 + params.beta
-        s[W_OTHER] = 0.5 / scale
+        record.spread = math.sqrt(scale)
+        record.w_centre = 1.0 - N / scale + 1.0 - params.alpha**2 + params.beta
+        record.w_other = 0.5 / scale

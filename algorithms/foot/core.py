@@ -1,0 +1,221 @@
+"""A sample's way through the state that all foot estimators share.
+
+A row is taken (:func:`take`) into the ring, watched for the rest at the start, and judged by the detector;
+once the decision about sample k − latency is there, :func:`release` hands that sample to the filter, which
+ends with :func:`emit`. A filter's kernel is therefore four lines; see :mod:`.iez9`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..numerics.compiled import compiled, inlined
+from ..numerics.records import Fields, record_type
+from ..numerics.rotations import quat_of
+from ..numerics.strapdown import NAVIGATION
+from . import rest
+from .detectors import DETECTOR, PITCH, decide
+from .detectors.pitch import start_tilt, track_tilt
+
+FloatArray = NDArray[np.float64]
+
+STEPS = record_type(
+    ("min_s", "f8"),
+    ("min_m", "f8"),
+    ("count", "i8"),
+    ("landing", "f8", (3,)),  # position of the newest landing, m
+    ("swing", "f8"),  # s since the newest still sample
+    ("was_still", "?"),
+)
+
+CORE: Fields = [
+    *NAVIGATION,
+    ("started", "?"),
+    ("n_still", "i8"),  # still samples since the start
+    ("stance_s", "f8"),  # s that the foot has been still without a break, at the released sample
+    ("taken", "i8"),  # rows taken
+    ("decided", "i8"),  # row up to which the detector's stages have come; runs past the end in a flush
+    ("released", "i8"),  # samples handed to the filter
+    ("time", "f8"),  # s since the first row, at the newest row
+    ("time_out", "f8"),  # the same at the released sample
+    ("repaired", "i8"),  # rows with a value that was not finite (held)
+    ("lowest", "f8", (6,)),  # of acceleration and angular rate
+    ("highest", "f8", (6,)),
+    ("steps", STEPS),
+    ("rest", rest.REST),
+    ("detector", DETECTOR),
+]
+"""Fields of every foot estimator's state, behind the filter's own.
+
+That order counts: numba takes a record for a subtype of one whose fields it begins with, and says so in a
+warning with every call.
+"""
+
+# Where the results lie in a result vector
+POSE, VELOCITY, STILL, STEP, SIGMA = 0, 7, 10, 11, 16
+AFTER_SIGMA = 25
+
+
+@inlined
+def take(s: Any, ring: Any, row: FloatArray) -> bool:
+    """Take a row into the state; return whether a sample can be released to the filter.
+
+    A value that is not finite is replaced by the previous row's (and counted): one NaN must not ruin the run.
+    """
+    mask = ring.shape[0] - 1
+    k = s.taken
+    r = ring[k & mask]
+    previous = ring[(k - 1) & mask] if k > 0 else r
+    dt = row[0] if k > 0 else 0.0
+    s.taken = k + 1
+    s.time += dt
+    r.dt = dt
+    repaired = False
+    for i in range(3):
+        value = row[1 + i]
+        if not math.isfinite(value):
+            repaired = True
+            value = previous.acc[i] if k > 0 else 0.0
+        r.acc[i] = value
+        _widen(s, i, value, k)
+        value = row[4 + i]
+        if not math.isfinite(value):
+            repaired = True
+            value = previous.gyr[i] if k > 0 else 0.0
+        r.gyr[i] = value
+        _widen(s, 3 + i, value, k)
+    if repaired:
+        s.repaired += 1
+    for i in range(4):
+        r.extra[i] = row[7 + i] if 7 + i < row.shape[0] else math.nan
+    x, y, z = r.acc[0], r.acc[1], r.acc[2]
+    r.acc_norm = math.sqrt(x * x + y * y + z * z)
+    x, y, z = r.gyr[0], r.gyr[1], r.gyr[2]
+    r.gyr_norm = math.sqrt(x * x + y * y + z * z)
+    if rest.watch(s.rest, r, k, s.time):
+        start_tilt(s.detector.pitch, s.rest.acc)
+    if s.rest.index < 0:
+        r.pitch = math.nan
+    elif s.detector.kind == PITCH:
+        track_tilt(s.detector.pitch, s.rest.gyr, r)
+    s.decided = k
+    decide(s.detector, ring, k, k)
+    return k >= s.detector.latency
+
+
+@inlined
+def _widen(s: Any, column: int, value: float, k: int) -> None:
+    if k == 0 or value < s.lowest[column]:
+        s.lowest[column] = value
+    if k == 0 or value > s.highest[column]:
+        s.highest[column] = value
+
+
+@compiled
+def take_end(s: Any, ring: Any) -> bool:
+    """After the last row: decide about the next sample held back, windows cut off; False if none is left."""
+    last = s.taken - 1
+    j = s.released
+    if j > last:
+        return False
+    # Where fewer rows came than the latency, stages are behind by more than one row.
+    while s.decided < j + s.detector.latency:
+        s.decided += 1
+        decide(s.detector, ring, s.decided, last)
+    return True
+
+
+@inlined
+def release(s: Any, ring: Any) -> Any:
+    """Count the next sample as released and return it."""
+    r = ring[s.released & (ring.shape[0] - 1)]
+    s.released += 1
+    s.time_out += r.dt
+    s.stance_s = s.stance_s + r.dt if r.still else 0.0
+    return r
+
+
+@inlined
+def starts(s: Any) -> bool:
+    """Start the navigation where the released sample completed the rest; return True at that sample only."""
+    if s.started or s.rest.index < 0 or s.released - 1 != s.rest.index:
+        return False
+    rest.start(s)
+    s.started = True
+    s.steps.was_still = True
+    return True
+
+
+@inlined
+def emit(s: Any, r: Any, out: FloatArray) -> None:
+    """Write pose, velocity, stance and step of the sample ``r``; NaN before the navigation has started."""
+    out[STILL] = 1.0 if r.still else 0.0
+    for i in range(5):
+        out[STEP + i] = math.nan
+    if not s.started:
+        for i in range(POSE, STILL):
+            out[i] = math.nan
+        return
+    for i in range(3):
+        out[POSE + i] = s.pos[i]
+        out[VELOCITY + i] = s.vel[i]
+    out[POSE + 3], out[POSE + 4], out[POSE + 5], out[POSE + 6] = quat_of(s.rot)
+    s.steps.swing += r.dt
+    if r.still:
+        s.n_still += 1
+        if not s.steps.was_still:
+            _land(s.steps, s.pos, out)
+        s.steps.swing = 0.0
+    s.steps.was_still = r.still
+
+
+@compiled
+def _land(steps: Any, pos: Any, out: FloatArray) -> None:
+    """At the first still sample after a swing: write the step from the previous landing, if long enough."""
+    x, y, z = pos[0] - steps.landing[0], pos[1] - steps.landing[1], pos[2] - steps.landing[2]
+    if steps.swing < steps.min_s or math.sqrt(x * x + y * y + z * z) < steps.min_m:
+        return
+    out[STEP] = steps.swing
+    out[STEP + 1] = steps.count
+    out[STEP + 2] = math.sqrt(x * x + y * y)
+    out[STEP + 3] = z
+    out[STEP + 4] = math.atan2(y, x)
+    steps.count += 1
+    for i in range(3):
+        steps.landing[i] = pos[i]
+
+
+@inlined
+def emit_sigma(s: Any, pos: int, vel: int, att: int, out: FloatArray) -> None:
+    """Write the standard deviations of position, velocity and attitude, by their first error states."""
+    for i in range(3):
+        if s.started:
+            out[SIGMA + i] = math.sqrt(max(0.0, s.P[pos + i, pos + i]))
+            out[SIGMA + 3 + i] = math.sqrt(max(0.0, s.P[vel + i, vel + i]))
+            out[SIGMA + 6 + i] = math.sqrt(max(0.0, s.P[att + i, att + i]))
+        else:
+            out[SIGMA + i] = math.nan
+            out[SIGMA + 3 + i] = math.nan
+            out[SIGMA + 6 + i] = math.nan
+
+
+@inlined
+def emit_detector(r: Any, first: int, out: FloatArray) -> None:
+    """Write the detector's statistics of the sample ``r`` to the end of the result."""
+    for i in range(out.shape[0] - first):
+        out[first + i] = r.statistic[i]
+
+
+@inlined
+def at_rest(s: Any, r: Any, since: float, rate: float) -> bool:
+    """Return whether the foot has been still for ``since`` s and turns by less than ``rate`` rad/s at ``r``.
+
+    The condition of a zero angular rate update; stricter than stance, for a walking foot rolls on as it
+    stands.
+    """
+    x, y, z = r.gyr[0] - s.bias_gyr[0], r.gyr[1] - s.bias_gyr[1], r.gyr[2] - s.bias_gyr[2]
+    return s.stance_s >= since and math.sqrt(x * x + y * y + z * z) < rate

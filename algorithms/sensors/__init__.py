@@ -1,1 +1,0 @@
-"""Calibration of inertial and magnetic sensors."""
