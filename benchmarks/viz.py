@@ -54,27 +54,28 @@ def _table(n: int) -> pl.DataFrame:
 def _columns(n: int) -> tuple[float, float]:
     import rerun as rr
     from marcha.replay import PlannedChannel
-    from marcha.viz.draw import new_stream
-    from marcha.viz.scene import Clock, Scene
+    from marcha.viz.scene import Scene
+    from marcha.viz.stream import new_stream
+    from marcha.viz.timeaxis import TimeAxis
 
     table = _table(n)
     channel = PlannedChannel(TOPIC, IMU, columns=tuple(table.columns[1:]))
     with tempfile.TemporaryDirectory() as folder:
         stream = new_stream()
         stream.set_sinks(rr.FileSink(Path(folder) / "x.rrd"))
-        scene = Scene(stream, [channel], Clock("duration"))
+        scene = Scene(stream, [channel], TimeAxis())
         scene.begin()
         start = time.perf_counter()
         scene.write(TOPIC, table)
         stream.flush()
         seconds = time.perf_counter() - start
         stream.disconnect()
-    return scene.rows / seconds, n / seconds
+    return scene.canvas.rows / seconds, n / seconds
 
 
 def _row_by_row(n: int) -> float:
     import rerun as rr
-    from marcha.viz.draw import new_stream
+    from marcha.viz.stream import new_stream
 
     values = _table(n)["acc_x"].to_list()
     with tempfile.TemporaryDirectory() as folder:

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from marcha.recording.errors import OutputExists, UsageError
 from marcha.viz import style
-from marcha.viz.plan import nice
-from marcha.viz.track import LIMIT, Track, compare, framed, reference_of
+from marcha.viz.top_view import nice
+from marcha.viz.trace import LIMIT, Trace, axes_error, compared, framed, reference_of
 
 from .test_viz_rrd import RUN, write_walk
 
@@ -120,8 +120,8 @@ def test_another_suffix_and_an_existing_file_are_refused(done: mr.Recording, tmp
 # -- tracks ------------------------------------------------------------------------------------------
 
 
-def line(n: int, *, turn: float = 0.0, start: float = 0.0) -> Track:
-    track = Track("t", "#000000")
+def line(n: int, *, turn: float = 0.0, start: float = 0.0) -> Trace:
+    track = Trace("t", "#000000")
     s = np.linspace(0.0, 10.0, n)
     xyz = np.column_stack([s * np.cos(turn) + start, s * np.sin(turn), 0 * s])
     for part in np.array_split(np.arange(n), 7):  # it comes in pieces
@@ -137,24 +137,24 @@ def test_a_long_track_is_thinned_evenly_and_bounded() -> None:
 
 
 def test_a_turned_and_moved_track_has_no_error() -> None:
-    found = compare(line(500, turn=1.0, start=3.0), line(500), "origin-yaw")
+    found = compared(line(500, turn=1.0, start=3.0), line(500), "origin-yaw")
     assert found is not None
-    np.testing.assert_allclose(found.error, 0.0, atol=1e-9)
+    np.testing.assert_allclose(axes_error(found), 0.0, atol=1e-9)
 
 
 def test_a_sparse_reference_is_compared_at_its_own_times() -> None:
-    reference = Track("r", "#000000")
+    reference = Trace("r", "#000000")
     reference.add(np.array([0, 200, 400]) * 1_000_000, line(500).positions[[0, 200, 400]])
-    found = compare(line(500), reference, "none")
+    found = compared(line(500), reference, "none")
     assert found is not None
     assert found.t_ns.tolist() == [0, 200_000_000, 400_000_000]
-    np.testing.assert_allclose(found.error, 0.0, atol=1e-9)
+    np.testing.assert_allclose(axes_error(found), 0.0, atol=1e-9)
 
 
 def test_tracks_that_do_not_meet_in_time_are_not_compared() -> None:
-    later = Track("r", "#000000")
+    later = Trace("r", "#000000")
     later.add(np.array([10**12, 10**12 + 10**6]), np.zeros((2, 3)))
-    assert compare(line(50), later, "none") is None
+    assert compared(line(50), later, "none") is None
 
 
 def test_a_run_is_compared_with_the_truth_of_its_own_sensor() -> None:
@@ -167,7 +167,7 @@ def test_a_run_is_compared_with_the_truth_of_its_own_sensor() -> None:
 
 
 def test_a_track_that_ran_away_does_not_set_the_frame() -> None:
-    away = Track("a", "#000000")
+    away = Trace("a", "#000000")
     away.add(np.arange(2), np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -500.0]]))
     good = line(50)
     assert framed([good, away]) == [good]

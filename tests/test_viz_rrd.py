@@ -18,12 +18,14 @@ import pytest
 import rerun as rr
 from marcha.recording.errors import MarchaError, OutputExists, UsageError
 from marcha.recording.selection import Selection
-from marcha.viz.artists import Sigma
-from marcha.viz.scene import TIMELINE
+from marcha.viz.timeaxis import SINCE_START, UTC
+from marcha.viz.views.tracks import Sigma
 from rerun.chunk import RrdReader
 
 RUN = "foot_9iez_foot_imu1"
 EPOCH = 1_700_000_000_000_000_000
+START = 5_000_000_000
+"""First time of the walk, by its device's clock."""
 
 
 @pytest.fixture(autouse=True)
@@ -114,7 +116,7 @@ def column(path: Path, entity: str, component: str) -> tuple[np.ndarray, np.ndar
         batch = chunk.to_record_batch()
         if chunk.is_static or component not in batch.schema.names:
             continue
-        times.append(batch.column(TIMELINE).cast("int64").to_numpy())
+        times.append(batch.column(SINCE_START).cast("int64").to_numpy())
         rows = batch.column(component).to_pylist()
         values.append(np.array(rows, dtype=object if isinstance(rows[0][0], str) else float))
     order = np.argsort(np.concatenate(times), kind="stable")
@@ -136,7 +138,7 @@ def statics(path: Path, entity: str, component: str) -> list:
 def test_signals_have_the_recordings_times_and_values(folder: Path, done: mr.Recording) -> None:
     imu = done.table("/foot/imu1")
     t_ns, acc = column(folder / "done.rrd", "/foot/imu1/acc", "Scalars:scalars")
-    np.testing.assert_array_equal(t_ns, imu["t_ns"].to_numpy())
+    np.testing.assert_array_equal(t_ns, imu["t_ns"].to_numpy() - START)
     np.testing.assert_array_equal(acc, imu.select("acc_x", "acc_y", "acc_z").to_numpy())
 
 
@@ -160,7 +162,7 @@ def test_estimates_stand_at_the_time_that_they_speak_of(folder: Path, done: mr.R
     pose = done.table(f"/estimate/{RUN}/pose", log_time=True)
     assert (pose["t_log_ns"] > pose["t_ns"]).any()  # the detector looks ahead
     t_ns, z = column(folder / "done.rrd", f"/run/{RUN}/height", "Scalars:scalars")
-    np.testing.assert_array_equal(t_ns, pose["t_ns"].to_numpy())
+    np.testing.assert_array_equal(t_ns, pose["t_ns"].to_numpy() - START)
     np.testing.assert_array_equal(z[:, 0], pose["pos_z"].to_numpy())
 
 
@@ -179,12 +181,12 @@ def test_a_reference_s_height_begins_at_zero_as_the_estimates_do(tmp_path: Path)
 def test_a_band_without_an_error_beside_it_fills_its_plot() -> None:
     sigma: Any = Sigma.__new__(Sigma)  # without a viewer's scene
     sigma.groups = {f"sigma_pos_{a}": (f"/run/r/sigma/pos_{a}", 1.0) for a in "xyz"}
-    sigma.scene = SimpleNamespace(columns=lambda *a: None, zoom={})
-    sigma.widest = 0.0
+    sigma.canvas = SimpleNamespace(columns=lambda *a: None, zoom={})
+    sigma.widest, sigma.plane = 0.0, False
     t_ns = np.arange(3)
     sigma.draw(t_ns, pl.DataFrame({f"sigma_pos_{a}": [0.0, 0.01, 0.02] for a in "xyz"}))
     sigma.end()
-    assert sigma.scene.zoom["/run/r/sigma/pos_x"] == pytest.approx((-0.026, 0.026))
+    assert sigma.canvas.zoom["/run/r/sigma/pos_x"] == pytest.approx((-0.026, 0.026))
 
 
 def test_every_sample_is_a_point_of_the_trail_and_a_pose_of_the_foot(
@@ -209,10 +211,10 @@ def test_lanes_hold_only_the_changes_and_end_with_the_recording(folder: Path, do
     still = done.table("/reference/stance")
     t_ns, state = column(folder / "done.rrd", "/reference/stance", "StateChange:state")
     change = np.flatnonzero(np.diff(still["still"].cast(int).to_numpy(), prepend=-1))
-    np.testing.assert_array_equal(t_ns[:-1], still["t_ns"].to_numpy()[change])
+    np.testing.assert_array_equal(t_ns[:-1], still["t_ns"].to_numpy()[change] - START)
     assert state[:2, 0].tolist() == ["still", "moving"]
     assert state[-1, 0] == ""
-    assert t_ns[-1] == done.table("/foot/imu1")["t_ns"].max()
+    assert t_ns[-1] == done.table("/foot/imu1")["t_ns"].max() - START
 
 
 def test_thresholds_are_lines_on_the_statistic_and_on_the_raw_norm(folder: Path, done: mr.Recording) -> None:
@@ -278,7 +280,7 @@ def test_steps_are_points_footprints_and_text(folder: Path, done: mr.Recording) 
     np.testing.assert_array_equal(length[:, 0], step["length_m"].to_numpy())
     t_ns, prints = column(path, f"/run/{RUN}/footprints", "Points3D:positions")
     there = step.select(t_ns="end_ns").join(pose, on="t_ns").select("pos_x", "pos_y", "pos_z").to_numpy()
-    np.testing.assert_array_equal(t_ns, step["end_ns"].to_numpy())
+    np.testing.assert_array_equal(t_ns, step["end_ns"].to_numpy() - START)
     np.testing.assert_allclose(prints[:, 0, :], there, atol=1e-5)
     _, text = column(path, f"/log/step/{RUN}", "TextLog:text")
     assert f"step 0, {step['length_m'][0]:.2f} m" in text[0, 0]
@@ -287,7 +289,7 @@ def test_steps_are_points_footprints_and_text(folder: Path, done: mr.Recording) 
 def test_annotations_are_a_lane_without_a_gap_between_neighbours(folder: Path) -> None:
     t_ns, label = column(folder / "done.rrd", "/annotation/surface", "StateChange:state")
     assert label[:, 0].tolist() == ["tiles", "grass", ""]
-    assert t_ns.tolist() == [5_000_000_000, 9_000_000_000, 12_000_000_000]
+    assert t_ns.tolist() == [0, 4_000_000_000, 7_000_000_000]
 
 
 def test_stances_of_a_replay_are_not_drawn_twice(folder: Path) -> None:
@@ -298,7 +300,7 @@ def test_the_error_is_what_the_evaluation_measures(folder: Path, done: mr.Record
     metrics = rp.evaluate(done, alignment="origin-yaw").runs[0].metrics
     t_ns, distance = column(folder / "done.rrd", f"/run/{RUN}/distance", "Scalars:scalars")
     _, error = column(folder / "done.rrd", f"/run/{RUN}/error", "Scalars:scalars")
-    np.testing.assert_array_equal(t_ns, done.table(f"/estimate/{RUN}/pose")["t_ns"].to_numpy())
+    np.testing.assert_array_equal(t_ns, done.table(f"/estimate/{RUN}/pose")["t_ns"].to_numpy() - START)
     np.testing.assert_allclose(np.linalg.norm(error, axis=1), distance[:, 0], atol=1e-12)
     assert distance.max() == pytest.approx(metrics["position_error_max_m"], abs=1e-9)
     assert distance.mean() == pytest.approx(metrics["position_error_mean_m"], abs=1e-9)
@@ -323,9 +325,9 @@ def test_the_report_names_runs_metrics_and_parameters(folder: Path) -> None:
         assert word in text
 
 
-def test_the_only_time_line_is_time(folder: Path) -> None:
+def test_the_time_line_is_since_the_start(folder: Path) -> None:
     names = {n for c in RrdReader(folder / "done.rrd").stream() for n in c.timeline_names}
-    assert names == {TIMELINE}
+    assert names == {SINCE_START}
 
 
 def test_rerun_finds_the_file_sound(folder: Path) -> None:
@@ -358,13 +360,16 @@ def test_live_shows_the_same_as_saved(folder: Path) -> None:
             np.testing.assert_array_equal(a, b, err_msg=entity)
 
 
-def test_device_time_is_a_duration_and_utc_a_timestamp(folder: Path, tmp_path: Path) -> None:
-    utc = viz.write_rrd(write_walk(tmp_path / "utc.mcap", start_ns=EPOCH), tmp_path / "utc.rrd")
-    for path, kind in ((folder / "done.rrd", "duration[ns]"), (utc, "timestamp[ns]")):
-        chunk = next(iter(RrdReader(path).stream().filter(content="/foot/baro")))
-        while chunk.is_static:
-            chunk = next(c for c in RrdReader(path).stream().filter(content="/foot/baro") if not c.is_static)
-        assert str(chunk.to_record_batch().schema.field(TIMELINE).type) == kind
+def test_a_clock_of_the_epoch_has_dates_beside_the_time_since_the_start(tmp_path: Path) -> None:
+    path = viz.write_rrd(write_walk(tmp_path / "utc.mcap", start_ns=EPOCH), tmp_path / "utc.rrd")
+    t_ns, _ = column(path, "/foot/baro", "Scalars:scalars")
+    assert t_ns[0] == 0
+    chunks = RrdReader(path).stream().filter(content="/foot/baro")
+    chunk = next(c for c in chunks if not c.is_static)
+    schema = chunk.to_record_batch().schema
+    assert str(schema.field(SINCE_START).type) == "duration[ns]"
+    assert str(schema.field(UTC).type) == "timestamp[ns]"
+    assert chunk.to_record_batch().column(UTC).cast("int64")[0].as_py() == EPOCH
 
 
 def test_several_recordings_stand_below_their_names_from_a_common_start(folder: Path, tmp_path: Path) -> None:
@@ -402,7 +407,7 @@ def test_a_selection_limits_topics_and_time(folder: Path, done: mr.Recording, tm
     options = Selection(topics=("/foot/imu1",), start_ns=6_000_000_000, end_ns=7_000_000_000)
     (path,) = viz.RrdExporter().export(done, tmp_path / "part.rrd", options)
     t_ns, _ = column(path, "/foot/imu1/acc", "Scalars:scalars")
-    assert (t_ns.min(), t_ns.max()) == (6_000_000_000, 6_995_000_000)
+    assert (t_ns.min(), t_ns.max()) == (1_000_000_000, 1_995_000_000)
     assert not any(e.startswith("/run") for e in entities(path))
 
 
@@ -435,15 +440,15 @@ def test_nothing_is_left_where_drawing_fails(
 def test_a_file_cut_short_is_not_put_in_place(
     done: mr.Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from marcha.viz import draw
+    from marcha.viz import stream
 
     def cut(file: object) -> None:
         part: Path = file.part  # type: ignore[attr-defined]
         part.write_bytes(part.read_bytes()[:-200])
         whole(file)  # type: ignore[arg-type]
 
-    whole = draw.check_whole
-    monkeypatch.setattr(draw, "check_whole", cut)
+    whole = stream.check_whole
+    monkeypatch.setattr(stream, "check_whole", cut)
     with pytest.raises(MarchaError, match="not written whole"):
         viz.write_rrd(done, tmp_path / "x.rrd")
     assert list(tmp_path.iterdir()) == []

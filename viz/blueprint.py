@@ -1,27 +1,22 @@
-"""Which views a recording gets, and how they are arranged.
+"""Which panels a recording gets, and how they are arranged.
 
-The layout follows from what the scenes show (:class:`marcha.viz.scene.Entry`), so a raw recording, one
-run, many runs and
-several recordings side by side all get the tabs they can fill: Overview, Raw, Detector, Compare, Report.
+The layout follows from what the views say that they show (:class:`marcha.viz.canvas.Entry`), so a raw
+recording, one run, many runs and several recordings side by side all get the tabs they can fill.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import rerun.blueprint as rrb
 from rerun.blueprint.api import VisualizerLike
 from rerun.encodings import EntityPathLike
 
-from . import plan
-from .scene import (
-    TIMELINE,
-    Entry,
-    Floats,
-    Scene,
-)
-from .track import STANDING_M, Track, framed
+from . import top_view
+from .canvas import COMPARE, DETECTOR, OVERVIEW, REPORT, SPACE, TABS, Canvas, Entry, Floats
+from .timeaxis import SINCE_START
+from .trace import STANDING_M, Trace, framed
 
 TRAIL_S = 60.0
 """Length of the trail behind the cursor where a recording is too long to show all of it."""
@@ -29,55 +24,140 @@ TRAIL_S = 60.0
 TRAIL_ROWS = 60_000
 """Up to this many samples the trail reaches back to the start."""
 
-SPATIAL = ("track", "trail", "foot", "mark", "footprints")
+HEIGHT = "height above the start (m)"
+DISTANCE = "distance to the reference (m)"
 BACKGROUND = (24, 28, 34)
+SPATIAL = ("space", "map")
+GRID_PLOTS = 4
+"""More plots of a tab than these stand in two columns."""
+
+Part = rrb.View | rrb.Container
 
 
-def blueprint(scenes: Sequence[Scene], *, live: bool = False) -> rrb.Blueprint:
-    """Return the blueprint of scenes that share one view.
+def blueprint(canvases: Sequence[Canvas], *, live: bool = False) -> rrb.Blueprint:
+    """Return the blueprint of recordings that share one view.
 
     Parameters
     ----------
-    scenes : sequence of Scene
+    canvases : sequence of Canvas
         Begun (live) or drawn (saved): extents and lengths are known only then.
     live : bool
         Whether data still comes: the cursor follows it.
     """
-    entries = [e for s in scenes for e in s.entries]
-    tabs = [
-        _overview(scenes, entries),
-        _raw(entries),
-        _detector(scenes, entries),
-        _compare(scenes, entries),
-        _report(entries),
-    ]
+    entries = [e for c in canvases for e in c.entries]
+    tabs = [_tab(name, canvases, entries) for name in tab_names(entries)]
     root = rrb.Tabs(*[t for t in tabs if t is not None], active_tab=0)
     return rrb.Blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following" if live else "paused"),
+        rrb.TimePanel(state="collapsed", timeline=SINCE_START, play_state="following" if live else "paused"),
         auto_layout=False,
         auto_views=False,
     )
 
 
-def _of(entries: Iterable[Entry], *roles: str) -> list[Entry]:
-    return [e for e in entries if e.role in roles]
+def tab_names(entries: Iterable[Entry]) -> list[str]:
+    """Return the tabs in their order: the known ones, those of plug-ins before *Compare* and *Report*."""
+    used = dict.fromkeys(e.tab for e in entries)
+    if any(e.kind == "space" and e.panel == SPACE for e in entries):
+        used[COMPARE] = None  # the tracks from above
+    others = [t for t in used if t not in TABS]
+    order = [*TABS[:-2], *others, *TABS[-2:]]
+    return [t for t in order if t in used]
 
 
-def _below(entries: Iterable[Entry]) -> list[str]:
-    """Return contents of a view: the entities and what lies below them."""
-    return [f"{e.path}/**" for e in entries]
+def _tab(name: str, canvases: Sequence[Canvas], entries: Sequence[Entry]) -> rrb.Container | None:
+    """Return one tab: what lies in space on the left, what runs over time on the right."""
+    mine = [e for e in entries if e.tab == name]
+    if name == COMPARE:
+        tracks = [e for e in entries if e.kind == "space" and e.panel == SPACE]
+        left = [_above(canvases, tracks)] if tracks else []
+        right = _panels(mine, canvases) or _panels([e for e in entries if e.panel == HEIGHT], canvases)
+        return _beside(name, left, right, [1, 1])
+    if name == DETECTOR:
+        return _detector(mine, canvases)
+    if name == REPORT:
+        documents = _panels([e for e in mine if e.kind == "document"], canvases)
+        logs = _panels([e for e in mine if e.kind == "log"], canvases)
+        first: list[Part] = [documents[0] if len(documents) == 1 else rrb.Tabs(*documents)]
+        return _beside(name, first, logs, [3, 2])
+    spatial = _panels([e for e in mine if e.kind in SPATIAL], canvases)
+    over_time = [e for e in mine if e.kind not in SPATIAL]
+    if name == OVERVIEW:
+        order = {HEIGHT: 0, "lanes": 1}
+        over_time.sort(key=lambda e: order.get(e.panel, 2))
+    if not (spatial or over_time):
+        return None
+    plots = _panels(over_time, canvases)
+    if spatial or name == OVERVIEW:
+        return _beside(name, spatial, plots, [3, 2], _shares(plots, over_time))
+    return rrb.Grid(*plots, grid_columns=2 if len(plots) >= GRID_PLOTS else 1, name=name)
 
 
-def _plot(
-    name: str, entries: Sequence[Entry], *, alone: bool = False, span: tuple[float, float] | None = None
-) -> rrb.TimeSeriesView:
-    """Return a plot of entities and what lies below them (``alone``: without that), zoomed to ``span``."""
+def _beside(
+    name: str,
+    left: Sequence[Part],
+    right: Sequence[Part],
+    shares: Sequence[float],
+    rows: Sequence[float] | None = None,
+) -> rrb.Container:
+    parts = [rrb.Vertical(*left)] if left else []
+    if right:
+        parts.append(rrb.Vertical(*right, row_shares=rows))
+    if len(parts) == 1:
+        return rrb.Vertical(*(left or right), row_shares=None if left else rows, name=name)
+    return rrb.Horizontal(*parts, column_shares=list(shares), name=name)
+
+
+def _panels(entries: Sequence[Entry], canvases: Sequence[Canvas]) -> list[Part]:
+    """Return one view for every panel, panels of one stack behind each other."""
+    panels: dict[tuple[str, str], list[Entry]] = {}
+    for entry in entries:
+        panels.setdefault((entry.kind, entry.panel), []).append(entry)
+    found: list[Part] = []
+    stacks: dict[str, list[Part]] = {}
+    places: dict[str, int] = {}
+    for own in panels.values():
+        view, stack = _view(own, canvases), own[0].stack
+        if not stack:
+            found.append(view)
+            continue
+        if stack not in stacks:
+            places[stack] = len(found)
+            found.append(view)
+        stacks.setdefault(stack, []).append(view)
+    for stack, views in stacks.items():
+        if len(views) > 1:
+            found[places[stack]] = rrb.Tabs(*views, name=stack)
+    return found
+
+
+def _view(entries: Sequence[Entry], canvases: Sequence[Canvas]) -> Part:
+    """Return the view of one panel."""
+    kind, panel = entries[0].kind, entries[0].panel
+    contents = [e.path if e.alone or kind != "plot" else f"{e.path}/**" for e in entries]
+    if kind == "plot":
+        return _plot(panel, contents, _span(entries, canvases))
+    if kind == "lanes":
+        link = rrb.TimeAxis(link="LinkToGlobal")
+        name = "stances, states and annotations"
+        return rrb.StateTimelineView(origin="/", contents=contents, name=name, time_view=link)
+    if kind == "map":
+        past = _past(entries, canvases)
+        provider = rrb.MapProvider.OpenStreetMap
+        return rrb.MapView(origin="/", contents=contents, name=panel, background=provider, overrides=past)
+    if kind == "space":
+        return _space(panel, entries, canvases)
+    if kind == "log":
+        return rrb.TextLogView(origin="/", contents=contents, name=panel)
+    return rrb.TextDocumentView(origin=entries[0].path, contents=contents, name=panel)
+
+
+def _plot(name: str, contents: Sequence[str], span: tuple[float, float] | None) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin="/",
-        contents=[e.path for e in entries] if alone else _below(entries),
+        contents=contents,
         name=name,
         axis_x=rrb.TimeAxis(link="LinkToGlobal"),
         axis_y=rrb.ScalarAxis(range=span) if span is not None else None,
@@ -85,48 +165,62 @@ def _plot(
     )
 
 
-def _lanes(entries: Sequence[Entry]) -> list[rrb.StateTimelineView]:
-    found = _of(entries, "stance", "annotation")
-    if not found:
-        return []
-    name = "stance" if not _of(found, "annotation") else "stance and annotations"
-    return [
-        rrb.StateTimelineView(
-            origin="/",
-            contents=[e.path for e in found],
-            name=name,
-            time_view=rrb.TimeAxis(link="LinkToGlobal"),
-        )
-    ]
+def _span(entries: Sequence[Entry], canvases: Sequence[Canvas]) -> tuple[float, float] | None:
+    """Return the range of a plot's vertical axis where the viewer's own choice would mislead."""
+    panel = entries[0].panel
+    if panel in (HEIGHT, DISTANCE):
+        traces, everything = _framed(canvases)
+        if everything:
+            return None
+        if panel == DISTANCE:
+            worst = max((t.worst_m for t in traces), default=0.0)
+            return (-0.1 * worst, 1.3 * worst) if worst else None
+        z = np.concatenate([t.positions[:, 2] for t in traces])
+        margin = 0.1 * (np.ptp(z) + STANDING_M)
+        return (float(z.min() - margin), float(z.max() + margin))
+    if any(e.path.endswith("/error") for e in entries):
+        return None  # it shows how wide the band is
+    zoom = {path: span for c in canvases for path, span in c.zoom.items()}
+    return next((zoom[e.path] for e in entries if e.path in zoom), None)
 
 
-def _spatial(entries: Sequence[Entry]) -> list[str]:
-    return [e.path for e in _of(entries, *SPATIAL)]
-
-
-def _past(scenes: Sequence[Scene], entries: Sequence[Entry]) -> dict[EntityPathLike, VisualizerLike]:
-    """Return what of its past each entity shows: trails and footprints all up to the cursor."""
+def _back() -> rrb.VisibleTimeRanges:
+    """Return the range of time from the start to the cursor."""
     boundary = rrb.TimeRangeBoundary
     end = boundary.cursor_relative()
-    past = rrb.VisibleTimeRanges(timeline=TIMELINE, start=boundary.infinite(), end=end)
-    short = rrb.VisibleTimeRanges(
-        timeline=TIMELINE, start=boundary.cursor_relative(seconds=-TRAIL_S), end=end
-    )
-    whole = all(t.seen <= TRAIL_ROWS for s in scenes for t in s.tracks.values())
-    return {
-        e.path: past if whole or e.role == "footprints" else short
-        for e in _of(entries, "trail", "footprints")
-    }
+    return rrb.VisibleTimeRanges(timeline=SINCE_START, start=boundary.infinite(), end=end)
 
 
-def _space(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Spatial3DView:
-    """Return the 3D view of all tracks."""
-    low, high = extent(scenes)
+def _past(
+    entries: Sequence[Entry], canvases: Sequence[Canvas]
+) -> dict[EntityPathLike, VisualizerLike | Iterable[VisualizerLike]]:
+    """Return what of its past each entity shows: trails and footprints all up to the cursor."""
+    boundary = rrb.TimeRangeBoundary
+    start, end = boundary.cursor_relative(seconds=-TRAIL_S), boundary.cursor_relative()
+    short = rrb.VisibleTimeRanges(timeline=SINCE_START, start=start, end=end)
+    whole = all(t.seen <= TRAIL_ROWS for c in canvases for t in c.traces.values())
+    return {e.path: short if not whole and e.path.endswith("/trail") else _back() for e in entries if e.past}
+
+
+def _space(panel: str, entries: Sequence[Entry], canvases: Sequence[Canvas]) -> Part:
+    """Return the 3D view of a panel; where there is a floor plan, the tracks from above lie before it."""
+    if panel != SPACE:
+        return _solid(panel, entries, canvases, np.array([-1.0, -1.0, -0.9]), np.array([1.0, 1.0, 0.6]))
+    low, high = extent(canvases)
+    solid = _solid(panel, entries, canvases, low, high)
+    if not any(c.flat for c in canvases):
+        return solid
+    return rrb.Tabs(_above(canvases, entries), solid, active_tab=0)
+
+
+def _solid(
+    name: str, entries: Sequence[Entry], canvases: Sequence[Canvas], low: Floats, high: Floats
+) -> rrb.Spatial3DView:
     centre, size = (low + high) / 2, max(float(np.linalg.norm((high - low)[:2])), 2.0)
     return rrb.Spatial3DView(
         origin="/",
-        contents=_spatial(entries),
-        name="track",
+        contents=[e.path for e in entries],
+        name=name,
         eye_controls=rrb.EyeControls3D(
             position=centre + np.array([-0.12, -0.78, 0.62]) * size,
             look_target=centre,
@@ -135,149 +229,68 @@ def _space(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Spatial3DVi
         background=rrb.Background(kind="SolidColor", color=BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=True, spacing=1.0, color=(255, 255, 255, 24)),
         spatial_information=rrb.SpatialInformation(target_frame="tf#/", show_axes=True),
-        overrides=_past(scenes, entries),
+        overrides=_past(entries, canvases),
     )
 
 
-def _plan(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Spatial2DView:
+def _above(canvases: Sequence[Canvas], entries: Sequence[Entry]) -> rrb.Spatial2DView:
     """Return the 2D view of all tracks from above."""
-    bounds = [0.0, plan.PIXELS]
+    bounds = [0.0, top_view.PIXELS]
     return rrb.Spatial2DView(
-        origin=plan.CAMERA,
-        contents=[*_spatial(entries), plan.GRID, plan.TICKS],
+        origin=top_view.CAMERA,
+        contents=[*(e.path for e in entries), top_view.GRID, top_view.TICKS],
         name="from above",
         background=rrb.Background(kind="SolidColor", color=BACKGROUND),
         visual_bounds=rrb.VisualBounds2D(x_range=bounds, y_range=bounds),
-        overrides=_past(scenes, entries),
+        overrides=_past(entries, canvases),
     )
 
 
-def _framed(scenes: Sequence[Scene]) -> tuple[list[Track], bool]:
+def _framed(canvases: Sequence[Canvas]) -> tuple[list[Trace], bool]:
     """Return the tracks that a view should be zoomed to, and whether those are all."""
-    tracks = [[t for t in s.tracks.values() if t.count] for s in scenes]
-    chosen = [t for own in tracks for t in framed(own)]
-    return chosen, len(chosen) == sum(len(own) for own in tracks)
+    traces = [[t for t in c.traces.values() if t.count] for c in canvases]
+    chosen = [t for own in traces for t in framed(own)]
+    return chosen, len(chosen) == sum(len(own) for own in traces)
 
 
-def extent(scenes: Sequence[Scene]) -> tuple[Floats, Floats]:
-    """Return the corners (3,), (3,) of the tracks as shown; a room of 10 m where nothing is known yet."""
-    tracks, _ = _framed(scenes)
-    if not tracks:
+def extent(canvases: Sequence[Canvas]) -> tuple[Floats, Floats]:
+    """Return the corners (3,), (3,) of tracks and anchors as shown; 10 m by 10 m where nothing is known."""
+    traces, _ = _framed(canvases)
+    points = [t.shown for t in traces]
+    for canvas in canvases:
+        plan = canvas.plan
+        points += [a.position[None, :] for a in plan.anchors.values()]
+        if not plan.anchors:
+            flat = list(plan.outlines)
+            if plan.picture is not None:
+                left, right, low, high = plan.corners
+                flat.append(np.array([[left, low], [right, high]]))
+            points += [np.column_stack([p, np.zeros(len(p))]) for p in flat]
+    if not points:
         return np.array([-5.0, -5.0, 0.0]), np.array([5.0, 5.0, 1.0])
-    points = np.concatenate([t.shown for t in tracks])
-    return points.min(axis=0), points.max(axis=0)
+    everything = np.concatenate(points)
+    return everything.min(axis=0), everything.max(axis=0)
 
 
-def _height(scenes: Sequence[Scene], entries: Sequence[Entry]) -> list[rrb.TimeSeriesView]:
-    found = _of(entries, "height")
-    if not found:
-        return []
-    tracks, everything = _framed(scenes)
-    span = None
-    if not everything:
-        z = np.concatenate([t.positions[:, 2] for t in tracks])
-        margin = 0.1 * (np.ptp(z) + STANDING_M)
-        span = (float(z.min() - margin), float(z.max() + margin))
-    return [_plot("height above the start (m)", found, span=span)]
+def _lane_share(entries: Sequence[Entry]) -> float:
+    return 0.4 + 0.19 * sum(e.kind == "lanes" for e in entries)
 
 
-def _overview(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Container | None:
-    lanes = _lanes(entries)
-    plots: list[rrb.View] = [*_height(scenes, entries), *lanes]
-    plots += [_plot(e.title, [e]) for e in _norms(scenes, entries)]
-    shares = [0.4 + 0.19 * len(_of(entries, "stance", "annotation")) if p in lanes else 1.0 for p in plots]
-    if not _of(entries, "track", "map"):
-        return rrb.Vertical(*plots, row_shares=shares, name="Overview") if plots else None
-    left: list[rrb.View] = []
-    if _of(entries, "track"):
-        left.append(_space(scenes, entries))
-    if fixes := _of(entries, "map"):
-        left.append(rrb.MapView(origin="/", contents=[e.path for e in fixes], name="map"))
-    return rrb.Horizontal(
-        rrb.Vertical(*left), rrb.Vertical(*plots, row_shares=shares), column_shares=[3, 2], name="Overview"
-    )
+def _shares(plots: Sequence[Part], entries: Sequence[Entry]) -> list[float]:
+    """Return the heights of panels: lanes need little."""
+    return [_lane_share(entries) if isinstance(p, rrb.StateTimelineView) else 1.0 for p in plots]
 
 
-def _norms(scenes: Sequence[Scene], entries: Sequence[Entry]) -> list[Entry]:
-    """Return the norms of the sensor that the first run reads, or of the first sensor."""
-    norms = _of(entries, "norm")
-    runs = [run for s in scenes for run in s.runs]
-    used = [e for e in norms if any(e.owner.rsplit(" ")[-1][1:].replace("/", "_") in run for run in runs)]
-    return (used or norms)[:2]
-
-
-def _raw(entries: Sequence[Entry]) -> rrb.Container | None:
-    raw = _of(entries, "raw")
-    if not raw:
-        return None
-    views = [_plot(e.title, [e], alone=True) for e in raw]
-    return rrb.Grid(*views, grid_columns=2 if len(views) > 3 else 1, name="Raw")
-
-
-def _by_owner(entries: Iterable[Entry]) -> Iterator[tuple[str, list[Entry]]]:
-    groups: dict[str, list[Entry]] = {}
-    for entry in entries:
-        groups.setdefault(entry.owner, []).append(entry)
-    yield from groups.items()
-
-
-def _detector(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Container | None:
-    """Return, side by side, every run's statistics against their thresholds, above all stance lanes."""
-    statistics = _of(entries, "detector")
-    if not statistics:
-        return None
-    zoom = {path: span for s in scenes for path, span in s.zoom.items()}
+def _detector(entries: Sequence[Entry], canvases: Sequence[Canvas]) -> rrb.Container | None:
+    """Return, side by side, every run's statistics against their thresholds, above all lanes."""
+    plots = [e for e in entries if e.kind == "plot"]
+    if not plots:
+        return None  # lanes alone are in the overview
     runs = [
-        rrb.Vertical(*[_plot(e.title, [e], span=zoom.get(e.path)) for e in found], name=owner)
-        for owner, found in _by_owner(statistics)
+        rrb.Vertical(*_panels([e for e in plots if e.owner == owner], canvases), name=owner)
+        for owner in dict.fromkeys(e.owner for e in plots)
     ]
     top = rrb.Horizontal(*runs) if len(runs) <= 3 else rrb.Tabs(*runs)
-    lanes = _lanes(entries)
-    shares = [3.0, *[0.4 + 0.19 * len(_of(entries, "stance", "annotation"))] * len(lanes)]
-    return rrb.Vertical(top, *lanes, row_shares=shares, name="Detector")
-
-
-def _compare(scenes: Sequence[Scene], entries: Sequence[Entry]) -> rrb.Container | None:
-    tracks = _of(entries, "track")
-    if not tracks:
-        return None
-    plots: list[rrb.View | rrb.Container] = []
-    if distance := _of(entries, "distance"):
-        tracks, everything = _framed(scenes)
-        worst = max((t.worst_m for t in tracks), default=0.0)
-        span = None if everything or worst == 0.0 else (-0.1 * worst, 1.3 * worst)
-        plots.append(_plot("distance to the reference (m)", distance, span=span))
-    errors = _of(entries, "error", "sigma")
-    if errors:
-        zoom = {path: span for s in scenes for path, span in s.zoom.items()}
-        views = [
-            _plot(f"{owner}: error and ±1σ of the position (m)", found)
-            if _of(found, "error")
-            else _plot(f"{owner}: ±1σ of the position (m)", found, span=zoom.get(found[0].path))
-            for owner, found in _by_owner(errors)
-        ]
-        plots.append(views[0] if len(views) == 1 else rrb.Tabs(*views))
-    if speed := _of(entries, "speed"):
-        plots.append(_plot("speed (m/s)", speed))
-    if steps := _of(entries, "step"):
-        plots.append(_plot("step length (m)", steps))
-    if not plots:
-        plots += _height(scenes, entries)
-    return rrb.Horizontal(
-        _plan(scenes, entries),
-        rrb.Vertical(*plots),
-        column_shares=[1, 1],
-        name="Compare",
-    )
-
-
-def _report(entries: Sequence[Entry]) -> rrb.Container:
-    reports = [
-        rrb.TextDocumentView(origin=e.path, contents=[e.path], name=e.title) for e in _of(entries, "report")
-    ]
-    documents = reports[0] if len(reports) == 1 else rrb.Tabs(*reports)
-    events = [e.path for e in _of(entries, "log")]
-    if not events:
-        return rrb.Vertical(documents, name="Report")
-    log = rrb.TextLogView(origin="/", contents=events, name="steps and annotations")
-    return rrb.Horizontal(documents, log, column_shares=[3, 2], name="Report")
+    lanes = _panels([e for e in entries if e.kind == "lanes"], canvases)
+    shares = [3.0, *[_lane_share(entries)] * len(lanes)]
+    return rrb.Vertical(top, *lanes, row_shares=shares, name=DETECTOR)

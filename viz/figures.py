@@ -17,14 +17,9 @@ from numpy.typing import NDArray
 from ..recording import Recording
 from ..recording.atomic import AtomicFile
 from ..recording.errors import UsageError
+from ..replay.metrics import Comparison
 from . import style
-from .track import (
-    Compared,
-    Track,
-    compare,
-    framed,
-    reference_of,
-)
+from .trace import Trace, compared, distance, framed, reference_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,27 +55,27 @@ def figure(recs: Recording | Sequence[Recording], *, alignment: str = ALIGNMENT)
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    scenes = [_scene(rec, alignment) for rec in ([recs] if isinstance(recs, Recording) else recs)]
-    if len(scenes) == 1:
-        size = (12.0, 7.0 if scenes[0].tracks else 4.0)
+    walks = [_walk(rec, alignment) for rec in ([recs] if isinstance(recs, Recording) else recs)]
+    if len(walks) == 1:
+        size = (12.0, 7.0 if walks[0].tracks else 4.0)
     else:
-        size = (13.0, 4.0 * len(scenes))
+        size = (13.0, 4.0 * len(walks))
     fig = Figure(figsize=size, dpi=120, layout="constrained", facecolor="white")
     FigureCanvasAgg(fig)
-    if len(scenes) == 1:
-        _one(fig, scenes[0])
+    if len(walks) == 1:
+        _one(fig, walks[0])
         return fig
-    for row, scene in zip(fig.subfigures(len(scenes), 1, squeeze=False)[:, 0], scenes, strict=True):
-        row.suptitle(scene.rec.path.stem, fontsize=11, fontweight="bold")
-        plan, *others = row.subplots(1, 3 if scene.with_errors else 2)
-        _plan(plan, scene)
+    for row, walk in zip(fig.subfigures(len(walks), 1, squeeze=False)[:, 0], walks, strict=True):
+        row.suptitle(walk.rec.path.stem, fontsize=11, fontweight="bold")
+        plan, *others = row.subplots(1, 3 if walk.with_errors else 2)
+        _plan(plan, walk)
         for ax, draw in zip(others, (_heights, _errors), strict=False):
-            _time(ax, draw, scene)
+            _time(ax, draw, walk)
             ax.set_xlabel("time since the start (s)", fontsize=9)
     handles = {}
-    for scene in scenes:
-        for track in scene.shown:
-            handles.setdefault(track.owner, _key(track, scene))
+    for walk in walks:
+        for track in walk.shown:
+            handles.setdefault(track.owner, _key(track, walk))
     fig.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize=8)
     return fig
 
@@ -129,13 +124,13 @@ def save_figure(
 
 
 @dataclass
-class _Scene:
+class _Walk:
     """A recording and what its figure needs of it."""
 
     rec: Recording
-    tracks: dict[str, Track]
-    references: dict[str, Track]
-    compared: dict[str, Compared]
+    tracks: dict[str, Trace]
+    references: dict[str, Trace]
+    compared: dict[str, Comparison]
     alignment: str
 
     @property
@@ -143,7 +138,7 @@ class _Scene:
         return self.rec.start_ns or 0
 
     @property
-    def shown(self) -> list[Track]:
+    def shown(self) -> list[Trace]:
         return [*self.references.values(), *self.tracks.values()]
 
     @property
@@ -164,53 +159,54 @@ def _position_sigma(rec: Recording, run: str) -> str:
     return topic if topic in rec.channels and {*POSITION_SIGMA} <= {*rec.channels[topic].columns} else ""
 
 
-def _scene(rec: Recording, alignment: str) -> _Scene:
+def _walk(rec: Recording, alignment: str) -> _Walk:
     """Read every run's track, in the order of the recording, and the reference's, and compare them."""
     poses = [t for t, c in rec.channels.items() if c.schema == POSE]
     runs = [t for t in poses if t.startswith("/estimate/") and t.endswith("/pose")]
     references = [t for t in poses if t.startswith("/reference/")]
     truth = {t: reference_of(t.split("/")[2], references) for t in runs}
-    found = {t: Track(t.split("/")[2], style.run_color(i)) for i, t in enumerate(runs)}
+    found = {t: Trace(t.split("/")[2], style.run_color(i)) for i, t in enumerate(runs)}
     for topic in truth.values() if runs else [reference_of("", references)]:
         if topic is not None:
-            found[topic] = Track(" ".join(topic.split("/")[1:-1]), style.REFERENCE)
+            found[topic] = Trace(" ".join(topic.split("/")[1:-1]), style.REFERENCE)
     for window in rec.windows(list(found)) if found else ():
         for topic, table in window.tables.items():
             position = table.select("pos_x", "pos_y", "pos_z").to_numpy()
             turn = table.select([f"quat_{a}" for a in "wxyz"]).to_numpy() if "quat_w" in table else None
             found[topic].add(table["t_ns"].to_numpy(), position, turn)
     found = {t: track for t, track in found.items() if track.count}
-    compared: dict[str, Compared] = {}
+    found_errors: dict[str, Comparison] = {}
     for topic, reference in truth.items():
         if topic in found and reference in found:
             track = found[topic]
-            result = compare(track, found[reference], alignment)
+            result = compared(track, found[reference], alignment)
             if result is not None:
-                track.place, track.worst_m, compared[track.owner] = result.place, result.worst_m, result
+                track.place, track.worst_m = result.transform, float(distance(result).max())
+                found_errors[track.owner] = result
     tracks = {found[t].owner: found[t] for t in runs if t in found}
     seen = {t: track for t, track in found.items() if t in references}
-    return _Scene(rec, tracks, seen, compared, alignment)
+    return _Walk(rec, tracks, seen, found_errors, alignment)
 
 
-def _one(fig: Figure, scene: _Scene) -> None:
+def _one(fig: Figure, walk: _Walk) -> None:
     """Lay out the figure of one recording: the plan on the left, everything over time on the right."""
-    fig.suptitle(scene.rec.path.stem, fontsize=12, fontweight="bold")
+    fig.suptitle(walk.rec.path.stem, fontsize=12, fontweight="bold")
     signals: Any = fig
     panels = [_signals]
-    if scene.shown:
+    if walk.shown:
         left, signals = fig.subfigures(1, 2, squeeze=False, width_ratios=[1.0, 1.1])[0]
         ax = left.subplots()
-        _plan(ax, scene)
+        _plan(ax, walk)
         left.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
-        panels = [_heights, _signals, *([_errors] if scene.with_errors else [])]
+        panels = [_heights, _signals, *([_errors] if walk.with_errors else [])]
     axes = signals.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for draw, ax in zip(panels, axes, strict=True):
-        _time(ax, draw, scene)
+        _time(ax, draw, walk)
     axes[-1].set_xlabel("time since the start of the recording (s)", fontsize=9)
 
 
-def _time(ax: Axes, draw: Callable[[Axes, _Scene], None], scene: _Scene) -> None:
-    draw(ax, scene)
+def _time(ax: Axes, draw: Callable[[Axes, _Walk], None], walk: _Walk) -> None:
+    draw(ax, walk)
     ax.grid(**GRID)
     ax.set_axisbelow(True)
 
@@ -226,29 +222,29 @@ def _label(ax: Axes, title: str, y: str) -> None:
     ax.tick_params(labelsize=8)
 
 
-def _line(track: Track, scene: _Scene) -> dict[str, Any]:
+def _line(track: Trace, walk: _Walk) -> dict[str, Any]:
     """Return how a track's line looks: the reference lies wide and pale under the runs."""
-    if track not in scene.references.values():
+    if track not in walk.references.values():
         return {"color": track.color, "linewidth": 1.4}
     return {"color": track.color, "linewidth": 3.0, "alpha": 0.6, "marker": "o" if track.sparse else ""}
 
 
-def _key(track: Track, scene: _Scene) -> Any:
+def _key(track: Trace, walk: _Walk) -> Any:
     from matplotlib.lines import Line2D
 
-    return Line2D([], [], **_line(track, scene))
+    return Line2D([], [], **_line(track, walk))
 
 
-def _plan(ax: Axes, scene: _Scene) -> None:
+def _plan(ax: Axes, walk: _Walk) -> None:
     """Draw all tracks from above, with equal axes, start and end marked."""
-    for track in scene.shown:
+    for track in walk.shown:
         x, y = _thin(*track.shown[:, :2].T)
-        ax.plot(x, y, **_line(track, scene), label=track.owner)
+        ax.plot(x, y, **_line(track, walk), label=track.owner)
         ax.plot(x[-1], y[-1], "s", color=track.color, markersize=6, markeredgecolor="white", zorder=4)
-    start = scene.shown[0].shown[0]
+    start = walk.shown[0].shown[0]
     ax.plot(start[0], start[1], "o", color="black", markersize=11, fillstyle="none", zorder=5, label="start")
     ax.plot([], [], "s", color="#666666", label="end")
-    inside = np.concatenate([t.shown[:, :2] for t in framed(scene.shown)])
+    inside = np.concatenate([t.shown[:, :2] for t in framed(walk.shown)])
     low, high = inside.min(axis=0), inside.max(axis=0)
     margin = 0.08 * max(float(np.max(high - low)), 1.0)
     ax.set_xlim(low[0] - margin, high[0] + margin)
@@ -256,39 +252,39 @@ def _plan(ax: Axes, scene: _Scene) -> None:
     ax.set_aspect("equal", adjustable="box")
     ax.grid(**GRID)
     ax.set_axisbelow(True)
-    _label(ax, f"from above{f' (alignment {scene.alignment})' if scene.compared else ''}", "y (m)")
+    _label(ax, f"from above{f' (alignment {walk.alignment})' if walk.compared else ''}", "y (m)")
     ax.set_xlabel("x (m)", fontsize=9)
 
 
-def _heights(ax: Axes, scene: _Scene) -> None:
-    for track in scene.shown:
-        t, z = _thin(scene.seconds(track.t_ns), track.shown[:, 2])
+def _heights(ax: Axes, walk: _Walk) -> None:
+    for track in walk.shown:
+        t, z = _thin(walk.seconds(track.t_ns), track.shown[:, 2])
         ax.plot(t, z, color=track.color, linewidth=1.0)
-    z = np.concatenate([t.shown[:, 2] for t in framed(scene.shown)])
+    z = np.concatenate([t.shown[:, 2] for t in framed(walk.shown)])
     margin = 0.1 * (float(np.ptp(z)) + 0.1)
     ax.set_ylim(float(z.min()) - margin, float(z.max()) + margin)
     _label(ax, "height", "z (m)")
 
 
-def _signals(ax: Axes, scene: _Scene) -> None:
+def _signals(ax: Axes, walk: _Walk) -> None:
     """Draw the accelerometer's norm, and under it one lane of stances for each run and the reference."""
-    rec, runs = scene.rec, list(scene.tracks)
+    rec, runs = walk.rec, list(walk.tracks)
     imus = [t for t, c in rec.channels.items() if "acc_x" in c.columns]
     read = [t for t in imus if any(t.strip("/").replace("/", "_") in run for run in runs)]
     drawn, high = (read or imus)[: 1 if runs else None], 0.0
     for i, topic in enumerate(drawn):
         table = rec.table(topic)
         acc = table.select("acc_x", "acc_y", "acc_z").to_numpy()
-        t, norm = _thin(scene.seconds(table["t_ns"].to_numpy()), np.linalg.norm(acc, axis=1))
+        t, norm = _thin(walk.seconds(table["t_ns"].to_numpy()), np.linalg.norm(acc, axis=1))
         ax.plot(t, norm, color=style.NORM if runs else style.run_color(i), linewidth=0.8, label=topic)
         high = max(high, float(np.nanmax(norm, initial=0.0)))
-    lanes = [(f"{t.rpartition('/')[0]}/stance", style.REFERENCE) for t in scene.references]
+    lanes = [(f"{t.rpartition('/')[0]}/stance", style.REFERENCE) for t in walk.references]
     lanes = lanes or [("/reference/stance", style.REFERENCE)]
     lanes += [(_topic(run, "stance"), style.run_color(i)) for i, run in enumerate(runs)]
     lanes = [(topic, color) for topic, color in lanes if topic in rec.channels]
     height = 0.09 * max(high, 1.0)
     for k, (topic, color) in enumerate(lanes):
-        bars = _stances(scene, topic)
+        bars = _stances(walk, topic)
         ax.broken_barh(bars, (-(k + 1.2) * height, 0.8 * height), facecolors=color, linewidth=0)
     title = f"norm of the accelerometer{f' of {drawn[0]}' if len(drawn) == 1 else ''}"
     _label(ax, title + (", and stances (bars: foot still)" if lanes else ""), "‖acc‖ (m/s²)")
@@ -299,31 +295,32 @@ def _signals(ax: Axes, scene: _Scene) -> None:
         ax.legend(fontsize=8, framealpha=0.9, loc="upper right")
 
 
-def _stances(scene: _Scene, topic: str) -> list[tuple[float, float]]:
+def _stances(walk: _Walk, topic: str) -> list[tuple[float, float]]:
     """Return the stances of a channel as (start, duration), s."""
-    table = scene.rec.table(topic)
+    table = walk.rec.table(topic)
     still = table["still"].cast(bool).to_numpy().astype(np.int8)
     edges = np.diff(still, prepend=np.int8(0), append=np.int8(0))
-    t = scene.seconds(table["t_ns"].to_numpy())
+    t = walk.seconds(table["t_ns"].to_numpy())
     first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
     return [(float(t[a]), float(t[b] - t[a])) for a, b in zip(first, last, strict=True)]
 
 
-def _errors(ax: Axes, scene: _Scene) -> None:
+def _errors(ax: Axes, walk: _Walk) -> None:
     """Draw every run's distance to the reference as a line, and its filter's own sigma as an area."""
-    inside, top = framed(scene.shown), 0.0
-    for run, track in scene.tracks.items():
-        if run in scene.compared:
-            found = scene.compared[run]
-            t, d = _thin(scene.seconds(found.t_ns), found.distance)
+    inside, top = framed(walk.shown), 0.0
+    for run, track in walk.tracks.items():
+        if run in walk.compared:
+            found = walk.compared[run]
+            far = distance(found)
+            t, d = _thin(walk.seconds(found.t_ns), far)
             ax.plot(t, d, color=track.color, linewidth=1.2)
-            top = max(top, found.worst_m) if track in inside else top
-        if topic := _position_sigma(scene.rec, run):
-            table = scene.rec.table(topic)
+            top = max(top, float(far.max())) if track in inside else top
+        if topic := _position_sigma(walk.rec, run):
+            table = walk.rec.table(topic)
             sigma = np.sqrt(np.sum(table.select(POSITION_SIGMA).to_numpy() ** 2, axis=1))
-            t, s = _thin(scene.seconds(table["t_ns"].to_numpy()), sigma)
+            t, s = _thin(walk.seconds(table["t_ns"].to_numpy()), sigma)
             ax.fill_between(t, 0.0, s, color=track.color, alpha=0.2, linewidth=0)
             top = max(top, float(np.nanmax(sigma, initial=0.0))) if track in inside else top
     ax.set_ylim(0.0, 1.1 * top if top > 0.0 else 1.0)
     title = "distance to the reference (area: the filter's own 1σ)"
-    _label(ax, title if scene.compared else "the filter's own 1σ of the position", "distance (m)")
+    _label(ax, title if walk.compared else "the filter's own 1σ of the position", "distance (m)")

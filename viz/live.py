@@ -12,6 +12,7 @@ from ..recording import Recording
 from ..recording.atomic import AtomicFile
 from ..recording.errors import UsageError
 from . import viewer
+from .text import printable
 from .viewer import Viewer
 
 if TYPE_CHECKING:
@@ -57,7 +58,8 @@ def show(
     """
     import rerun as rr
 
-    from .draw import draw, new_stream
+    from .draw import draw
+    from .stream import finish, new_stream, release
 
     recs = [recs] if isinstance(recs, Recording) else list(recs)
     window = viewer.web(open_browser=open_browser) if web else viewer.native()
@@ -67,8 +69,9 @@ def show(
         stream = new_stream()
         stream.set_sinks(rr.GrpcSink(viewer.uri(window.port)))
         draw(recs, stream)
-        stream.flush()
-        stream.disconnect()
+        finish(stream)
+        del stream
+        release()
         if wait if wait is not None else web:
             with window:
                 window.wait()
@@ -126,7 +129,7 @@ class LiveSink:
         """Open the file and the viewers."""
         import rerun as rr
 
-        from .draw import new_stream
+        from .stream import new_stream
 
         self._plan = plan
         sinks: list[rr.FileSink | rr.GrpcSink] = []
@@ -141,7 +144,7 @@ class LiveSink:
             sinks += [rr.GrpcSink(viewer.uri(v.port)) for v in self.viewers]
             self._stream = new_stream()
             self._stream.set_sinks(*sinks)
-            self._stream.send_recording_name(Path(plan.source).stem)
+            self._stream.send_recording_name(printable(Path(plan.source).stem))
         except BaseException:
             self._abort()
             raise
@@ -172,9 +175,9 @@ class LiveSink:
         import rerun as rr
 
         from .blueprint import blueprint, extent
-        from .draw import finish
-        from .plan import log_plan
         from .report import replay_report
+        from .stream import finish, release, send_blueprint
+        from .top_view import log_top_view
 
         if result is None:
             self._abort()
@@ -184,11 +187,16 @@ class LiveSink:
             scene = self._begun(0)
             scene.end()
             text = rr.TextDocument(replay_report(result), media_type=rr.MediaType.MARKDOWN)
-            scene.static(f"{scene.prefix}/report", text)
-            log_plan(self._stream, *extent([scene]))
+            canvas = scene.canvas
+            canvas.static(f"{canvas.prefix}/report", text)
+            log_top_view(self._stream, *extent([canvas]))
             # the saved view opens at the whole track; open viewers keep what their user has arranged
-            self._stream.send_blueprint(blueprint([scene]), make_active=False)
+            send_blueprint(self._stream, blueprint([canvas]), make_active=False)
             finish(self._stream, self._file)
+            del scene, canvas
+            self._scene = None
+            del self._stream
+            release()
         except BaseException:
             self._abort()
             raise
@@ -202,15 +210,17 @@ class LiveSink:
             window.close()
 
     def _begun(self, t_ns: int) -> Scene:
-        """Return the scene; its clock is known with the first message."""
+        """Return the scene; where time begins is known with the first message."""
         from .blueprint import blueprint, extent
-        from .draw import clock_from
-        from .plan import log_plan
         from .scene import Scene
+        from .stream import send_blueprint
+        from .timeaxis import axis_from
+        from .top_view import log_top_view
 
         if self._scene is None:
-            self._scene = Scene(self._stream, self._plan.channels.values(), clock_from(t_ns))
+            self._scene = Scene(self._stream, self._plan.channels.values(), axis_from(t_ns))
             self._scene.begin()
-            log_plan(self._stream, *extent([self._scene]))  # a room of 10 m until more is known
-            self._stream.send_blueprint(blueprint([self._scene], live=True))
+            canvas = self._scene.canvas
+            log_top_view(self._stream, *extent([canvas]))  # 10 m by 10 m until more is known
+            send_blueprint(self._stream, blueprint([canvas], live=True))
         return self._scene

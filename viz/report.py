@@ -10,6 +10,7 @@ from ..recording import Recording
 from ..recording import open as open_recording
 from ..recording.errors import MarchaError
 from ..replay import ReplayResult, evaluate
+from .text import printable
 
 LONGEST = 120
 """Characters of a cell; longer values (JSON, hashes) are cut, the recording has them whole."""
@@ -26,7 +27,7 @@ def report(rec: Recording) -> str:
         Raw, or with estimates (their metrics are measured, see :func:`marcha.replay.evaluate`).
     """
     runs = {n.removeprefix("run/"): m for n, m in rec.metadata.items() if n.startswith("run/")}
-    parts = [f"# {rec.path.name}", "", f"{rec.duration_s:.2f} s, {len(rec.channels)} channels", ""]
+    parts = [f"# {printable(rec.path.name)}", "", f"{rec.duration_s:.2f} s, {len(rec.channels)} channels", ""]
     if runs or any(t.startswith("/estimate/") for t in rec.channels):
         parts += _metrics(rec)
     if runs:
@@ -41,7 +42,11 @@ def report(rec: Recording) -> str:
     parts += ["## Channels", "", *_table(["topic", "message", "count"], rows)]
     for name, record in rec.metadata.items():
         if not name.startswith("run/"):
-            parts += [f"## {name}", "", *_table(["what", "value"], [[k, v] for k, v in record.items()])]
+            parts += [
+                f"## {printable(name)}",
+                "",
+                *_table(["what", "value"], [[k, v] for k, v in record.items()]),
+            ]
     return "\n".join(parts)
 
 
@@ -68,7 +73,7 @@ def _metrics(rec: Recording) -> list[str]:
     try:
         runs = evaluate(rec).runs
     except MarchaError as error:
-        return ["## Metrics", "", f"Not measured: {error}", ""]
+        return ["## Metrics", "", f"Not measured: {printable(error)}", ""]
     names = list(dict.fromkeys(m for r in runs for m in r.metrics))
     rows = [[m, *(_number(r.metrics.get(m)) for r in runs)] for m in names]
     parts = ["## Metrics", "", *_table(["metric", *(r.run for r in runs)], rows)]
@@ -80,7 +85,7 @@ def _metrics(rec: Recording) -> list[str]:
                 "",
             ]
         if run.note:
-            parts += [f"{run.run}: {run.note}", ""]
+            parts += [f"{run.run}: {printable(run.note)}", ""]
     return parts
 
 
@@ -111,5 +116,5 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def _cell(text: str) -> str:
-    text = " ".join(str(text).split()).replace("|", "\\|")
+    text = printable(" ".join(str(text).split())).replace("|", "\\|")
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"

@@ -52,12 +52,15 @@ def write_rrd(
     try:
         import rerun as rr
 
-        from .draw import draw, finish, new_stream
+        from .draw import draw
+        from .stream import finish, new_stream, release
 
         stream = new_stream()
         stream.set_sinks(rr.FileSink(file.part))
         draw(recs, stream, selection)
         finish(stream, file)
+        del stream
+        release()
     except BaseException:
         file.abort()
         raise

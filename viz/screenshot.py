@@ -69,20 +69,17 @@ def screenshots(
     import numpy as np
     from rerun.experimental import ViewerClient
 
-    from .scene import TIMELINE
+    from .timeaxis import SINCE_START
 
     path = Path(rrd).resolve()
     with viewer.native(headless=True, size=size) as process:
         client = ViewerClient.connect(viewer.uri(process.port))
         client.open(str(path))
         state = _loaded(client, path, patience_s)
-        line = next(t for t in state.recordings[0].timelines if t.name == TIMELINE)
+        line = next(t for t in state.recordings[0].timelines if t.name == SINCE_START)
         start, end = line.start or 0, line.end or 0
         cursor = start + round((end - start) * at)
-        if line.time_type == "timestamp":
-            client.set_time(TIMELINE, timestamp=np.datetime64(cursor, "ns"), play_state="paused")
-        else:
-            client.set_time(TIMELINE, duration=np.timedelta64(cursor, "ns"), play_state="paused")
+        client.set_time(SINCE_START, duration=np.timedelta64(cursor, "ns"), play_state="paused")
         layout = client.get_blueprint(of="recording").blueprint
         pictures = []
         for tab in tabs:

@@ -19,8 +19,15 @@ RUNS = ("#2F8FD0", "#D55E00", "#009E73", "#B86FA5", "#C98500", "#1AA3A3", "#8F7B
 REFERENCE = "#8A8A8A"
 THRESHOLD = "#E0556F"
 NORM = "#8F7BE0"
+ENCODER = "#B86FA5"
+"""Angles and orientations that a device states itself."""
+
 STILL = "#009E73"
 MOVING = "#8A8A8A"
+
+
+DEGREES = 57.29577951308232
+"""Degrees a radian."""
 
 
 class Column(NamedTuple):
@@ -38,7 +45,7 @@ COLUMNS = {
     **{f"vel_{a}": Column(f"velocity {a} (m/s)") for a in "xyz"},
     **{f"sigma_pos_{a}": Column(f"position {a} (m)") for a in "xyz"},
     **{f"sigma_vel_{a}": Column(f"velocity {a} (m/s)") for a in "xyz"},
-    **{f"sigma_att_{a}": Column(f"attitude {a} (°)", 57.29577951308232) for a in "xyz"},
+    **{f"sigma_att_{a}": Column(f"attitude {a} (°)", DEGREES) for a in "xyz"},
     "acc_norm": Column("‖acc‖ (m/s²)"),
     "acc_var": Column("variance of ‖acc‖ (m²/s⁴)"),
     "gyr_norm": Column("‖gyr‖ (rad/s)"),
@@ -54,6 +61,19 @@ COLUMNS = {
     "length_m": Column("length (m)"),
 }
 """Columns with a name of their own; others are shown as ``column (unit)`` of their schema."""
+
+
+SUFFIXES = {
+    "_deg": "°",
+    "_dbm": "dBm",
+    "_m_s": "m/s",
+    "_hz": "Hz",
+    "_s": "s",
+    "_m": "m",
+    "_pa": "Pa",
+    "_percent": "%",
+}
+"""Units that the end of a name says."""
 
 
 def run_color(index: int) -> str:

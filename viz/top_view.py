@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from .scene import Floats
+from .trace import Floats
 
-CAMERA = "/plan/camera"
-GRID = "/plan/grid"
-TICKS = "/plan/ticks"
+CAMERA = "/top_view/camera"
+GRID = "/top_view/grid"
+TICKS = "/top_view/ticks"
 PIXELS = 1000.0
 """Width of the camera's picture; only a scale, the viewer zooms into it without loss."""
 
@@ -22,7 +22,7 @@ LINES = 12
 GREY = (110, 116, 124)
 
 
-def log_plan(stream: rr.RecordingStream, low: Floats, high: Floats) -> None:
+def log_top_view(stream: rr.RecordingStream, low: Floats, high: Floats) -> None:
     """Log the camera above the box from ``low`` to ``high`` (3,), m, and a grid with its metres.
 
     The camera looks straight down, x to the right and y up, as maps do.

@@ -1,0 +1,81 @@
+"""Views that are installed: built-in ones and those of plug-ins, by the entry point group ``marcha.views``."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Callable
+from functools import lru_cache
+from importlib.metadata import EntryPoints, entry_points
+
+from .canvas import Canvas, ChannelLike
+from .views.base import View
+from .views.common import General
+
+GROUP = "marcha.views"
+
+
+def available_views() -> dict[str, type[View]]:
+    """Return every registered view by name; a plug-in that cannot be used is a warning with its name."""
+    return dict(_views(entry_points, tuple(sys.path)))
+
+
+@lru_cache(maxsize=8)
+def _views(scan: Callable[..., EntryPoints], path: tuple[str, ...]) -> dict[str, type[View]]:
+    """Load the views, once a ``sys.path``: a scan of what is installed takes 10 ms."""
+    found: dict[str, type[View]] = {}
+    for point in sorted(scan(group=GROUP), key=lambda p: p.name):
+        try:
+            view = point.load()
+            if not (isinstance(view, type) and issubclass(view, View)):
+                raise TypeError("it is no subclass of marcha.viz.views.View")
+        except Exception as error:
+            warnings.warn(f"view plug-in {point.name} ({point.value}) cannot be used: {error}", stacklevel=2)
+            continue
+        found[point.name] = view
+    return found
+
+
+def views_of(canvas: Canvas, channel: ChannelLike) -> list[View]:
+    """Return the views that draw a channel: the one that fits best, and those that draw beside it.
+
+    A view that fails in ``fits`` or when it is made is left out with a warning that names it; the general
+    view stands in.
+    """
+    own: list[tuple[int, int, str, type[View]]] = []
+    beside: list[tuple[str, type[View]]] = []
+    for name, kind in available_views().items():
+        try:
+            if not kind.fits(channel):
+                continue
+        except Exception as error:
+            warn(kind, channel, error)
+            continue
+        if kind.beside:
+            beside.append((name, kind))
+        else:
+            own.append((-kind.priority, -len(kind.needs), name, kind))
+    drawn: list[View] = []
+    for kind in [*(k for *_, k in sorted(own, key=lambda o: o[:3])), General]:
+        try:
+            drawn.append(kind(canvas, channel))
+            break
+        except Exception as error:
+            if kind is General:
+                raise
+            warn(kind, channel, error)
+    for _, kind in beside:
+        try:
+            drawn.append(kind(canvas, channel))
+        except Exception as error:
+            warn(kind, channel, error)
+    return drawn
+
+
+def warn(kind: type[View], channel: ChannelLike, error: Exception) -> None:
+    """Say that a view failed on a channel."""
+    name = next((n for n, k in available_views().items() if k is kind), kind.__name__)
+    reason = f"{type(error).__name__}: {error}".splitlines()[0]
+    warnings.warn(
+        f"view plug-in {name} ({kind.__module__}) failed on {channel.topic}: {reason}", stacklevel=3
+    )

@@ -1,0 +1,355 @@
+"""Views of linked segments: joint angles beside their reference with the error in its sigma band, orientations
+of segments, the segments themselves as a moving figure, optical markers.
+"""
+
+# ruff: noqa: D102 - begin, draw and end are documented once, in View
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import rerun as rr
+
+from ...recording.rotations import xyzw_from_wxyz
+from ...replay.alignment import match
+from .. import style
+from ..canvas import ESTIMATES, JOINTS, RAW, Canvas, ChannelLike, Floats, Times, columns_of
+from ..curve import Curve
+from .base import View, role_of
+from .common import EULER, Values, euler_deg, slug
+
+FIGURE = "segments"
+MAX_GAP_S = 0.1
+"""A reference is not interpolated over longer gaps."""
+
+BONES: dict[str, tuple[float, float, float]] = {
+    "trunk": (0.0, 0.0, 0.5),
+    "pelvis": (0.0, 0.0, 0.15),
+    "thigh": (0.0, 0.0, -0.42),
+    "shank": (0.0, 0.0, -0.41),
+    "foot": (0.0, 0.2, 0.0),
+}
+"""Where a segment ends, seen from its proximal joint, in its own frame (x right, y forward, z up), m. A
+channel's metadata ``bone_x``, ``bone_y``, ``bone_z`` say it for other segments."""
+
+OTHER_BONE = (0.0, 0.0, -0.3)
+PARENTS = {"shank": "thigh", "foot": "shank"}
+"""Which segment a segment hangs on; trunk and thighs meet at the hips."""
+
+
+def series_of(canvas: Canvas) -> dict[tuple[str, str], Curve]:
+    """Return the canvas's angles over time by topic and joint."""
+    return canvas.store.setdefault("joint angles", {})
+
+
+class Angles(View):
+    """Joint angles, one panel a joint that runs, reference and encoder share; rates and torques."""
+
+    title = "joint angles beside their reference, error, rates, torques"
+    schemas = ("sensor_msgs/msg/JointState",)
+    KINDS = ((".vel", "angular rate", "°/s", style.DEGREES), (".effort", "torque", "N m", 1.0))
+
+    def begin(self) -> None:
+        canvas = self.canvas
+        self.columns: dict[str, tuple[str, float]] = {}
+        color = style.ENCODER if self.role == "raw" else self.color
+        tab = JOINTS
+        self.joints = [c for c in self.channel.columns if not c.endswith((".vel", ".effort"))]
+        for joint in self.joints:
+            kinds = (("", "angle", "°", style.DEGREES), *self.KINDS)
+            for suffix, title, unit, factor in kinds:
+                if joint + suffix in self.channel.columns:
+                    path = f"{self.path}/{slug(joint)}{suffix.replace('.', '/')}"
+                    self.columns[joint + suffix] = (path, factor)
+                    canvas.lines(path, [f"{self.owner} {joint} ({unit})"], [color])
+                    panel = f"{joint} {title} ({unit})"
+                    canvas.show("plot", path, tab=tab, panel=panel, owner=self.owner, alone=True)
+            series_of(canvas)[self.channel.topic, joint] = Curve()
+
+    def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
+        for column, (path, factor) in self.columns.items():
+            values = columns_of(block, [column], [factor])[:, 0]
+            self.canvas.scalars(path, t_ns, values)
+            if column in self.joints:
+                series_of(self.canvas)[self.channel.topic, column].add(t_ns, values)
+
+    def end(self) -> None:
+        if self.role != "estimate":
+            return
+        canvas = self.canvas
+        for joint in self.joints:
+            topic = angle_reference(canvas, self.channel, joint)
+            if topic is None:
+                continue
+            own, truth = series_of(canvas)[self.channel.topic, joint], series_of(canvas)[topic]
+            t_ns, error = difference(own, truth)
+            if not t_ns.size:
+                continue
+            path = f"{self.path}/{slug(joint)}/error"
+            canvas.lines(path, [f"{self.owner} {joint} error (°)"], [self.color])
+            canvas.scalars(path, t_ns, error)
+            panel = error_panel(joint)
+            canvas.show("plot", path, tab=JOINTS, panel=panel, owner=self.owner)
+
+
+def error_panel(joint: str) -> str:
+    """Return the name of the panel of a joint's error."""
+    return f"{joint} error and ±1σ (°)"
+
+
+def angle_reference(canvas: Canvas, channel: ChannelLike, joint: str) -> tuple[str, str] | None:
+    """Return topic and name of the angle that a run's joint is compared with.
+
+    A reference before an encoder, the same name before an only one.
+    """
+    for role in ("reference", "raw"):
+        found = [k for k in series_of(canvas) if role_of(k[0]) == role and k[0] != channel.topic]
+        same = [k for k in found if k[1] == joint]
+        if same:
+            return same[0]
+        if len(found) == 1 and sum(k[0] == channel.topic for k in series_of(canvas)) == 1:
+            return found[0]
+    return None
+
+
+def difference(own: Curve, truth: Curve) -> tuple[Times, Floats]:
+    """Return times (n,) and estimate minus reference (n,), where both are known."""
+    t, v = own.finite()
+    t_ref, v_ref = truth.finite()
+    found = match(t, t_ref, MAX_GAP_S)
+    if not len(found.index):
+        return np.empty(0, np.int64), np.empty(0)
+    return t[found.index], v[found.index] - found.linear(v_ref[:, None])[:, 0]
+
+
+class AngleSigma(Values):
+    """Stated standard deviations of joint angles: a band about zero in the panel of the joint's error."""
+
+    title = "stated standard deviations of joint angles, as bands"
+    priority = 1
+
+    @classmethod
+    def fits(cls, channel: ChannelLike) -> bool:
+        return (
+            super().fits(channel)
+            and channel.topic.endswith("/sigma")
+            and role_of(channel.topic) == "estimate"
+        )
+
+    def begin(self) -> None:
+        parent = self.channel.topic.rpartition("/")[0]
+        joints = {
+            c
+            for other in self.canvas.channels
+            if other.schema == "sensor_msgs/msg/JointState" and other.topic.startswith(f"{parent}/")
+            for c in other.columns
+        }
+        self.bands = {c: j for c in self.channel.columns if (j := plain_name(c)) in joints}
+        super().begin()
+        for column, joint in self.bands.items():
+            path = f"{self.path}/{slug(column)}/band"
+            archetype = rr.Measurements.from_fields(
+                names=f"{self.owner} ±1σ {joint}", units="°", colors=style.rgb(self.color), widths=0.5
+            )
+            self.canvas.static(path, archetype)
+            self.canvas.show("plot", path, tab=JOINTS, panel=error_panel(joint), owner=self.owner)
+
+    def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
+        super().draw(t_ns, block)
+        for column in self.bands:
+            sigma = columns_of(block, [column], [style.DEGREES])[:, 0]
+            if np.isfinite(sigma).any():
+                columns = rr.Measurements.columns(values=np.zeros(len(t_ns)), variances=sigma * sigma)
+                self.canvas.columns(f"{self.path}/{slug(column)}/band", t_ns, columns)
+
+
+def plain_name(column: str) -> str:
+    """Return the joint that a column of sigma speaks of: ``sigma_knee_rad`` is the knee's."""
+    return column.removeprefix("sigma_").removesuffix("_rad")
+
+
+class Orientation(View):
+    """An orientation as roll, pitch and yaw; of a segment also as a bone of the moving figure."""
+
+    title = "orientations as roll, pitch, yaw, and segments as a moving figure"
+    schemas = ("geometry_msgs/msg/QuaternionStamped",)
+    needs = ("quat_w", "quat_x", "quat_y", "quat_z")
+
+    def begin(self) -> None:
+        canvas = self.canvas
+        self.segment = segment_of(self.channel.topic)
+        color = self.color if self.role != "raw" else style.ENCODER
+        if self.segment is None:
+            canvas.lines(self.path, [f"{a} (°)" for a in EULER], style.AXES)
+            panel = f"{self.owner} {self.what} (°)" if self.role == "estimate" else f"{self.owner} (°)"
+            tab = ESTIMATES if self.role == "estimate" else RAW
+            canvas.show("plot", self.path, tab=tab, panel=panel, owner=self.owner, alone=True)
+            return
+        for axis in EULER:
+            path = f"{self.path}/{axis}"
+            canvas.lines(path, [f"{self.owner} {axis} (°)"], [color])
+            panel = f"{self.segment} {axis} (°)"
+            canvas.show("plot", path, tab=JOINTS, panel=panel, owner=self.owner, stack=self.segment)
+        self.figure = f"{self.parent}/figure"
+        side, kind = split_side(self.segment)
+        self.bone = bone_of(self.channel, kind)
+        self.tips = tips_of(canvas, self.figure)
+        parent = side + PARENTS.get(kind, "")
+        above = [
+            segment_of(c.topic) for c in canvas.channels if canvas.group(c.topic).startswith(self.parent)
+        ]
+        self.above = parent if kind in PARENTS and parent in above else previous(canvas, self.channel)
+        self.waiting: list[tuple[Times, Floats]] = []
+        self.at = f"{self.figure}/{slug(self.segment)}"
+        ends = np.array([[0.0, 0.0, 0.0], self.bone], dtype=np.float32)
+        rgb = style.rgb(color)
+        bone = rr.LineStrips3D([ends], colors=rgb, radii=0.02 if self.role != "reference" else 0.012)
+        canvas.static(f"{self.at}/bone", bone)
+        canvas.static(f"{self.at}/axes", rr.TransformAxes3D(0.12))
+        label = rr.Points3D([ends[1] * 0.5], labels=[self.segment], colors=rgb, radii=0.005, show_labels=True)
+        canvas.static(f"{self.at}/name", label)
+        for part in ("bone", "axes", "name"):
+            at = f"{self.at}/{part}"
+            canvas.show("space", at, tab=JOINTS, panel=FIGURE, owner=self.owner)
+
+    def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
+        turn = columns_of(block, [f"quat_{a}" for a in "wxyz"])
+        angles = euler_deg(turn)
+        if self.segment is None:
+            self.canvas.scalars(self.path, t_ns, angles)
+            return
+        for i, axis in enumerate(EULER):
+            self.canvas.scalars(f"{self.path}/{axis}", t_ns, angles[:, i])
+        good = np.isfinite(turn).all(axis=1)
+        self.waiting.append((t_ns[good], turn[good]))
+        self._bones(whole=False)
+
+    def end(self) -> None:
+        if self.segment is not None:
+            self._bones(whole=True)
+
+    def _bones(self, whole: bool) -> None:
+        """Log the bone where the end of the one above is known; hold it where that one has ended."""
+        if not self.waiting:
+            return
+        t_ns = np.concatenate([t for t, _ in self.waiting])
+        turn = np.concatenate([q for _, q in self.waiting])
+        above = self.tips.get(self.above or "")
+        ready = np.ones(len(t_ns), bool)
+        if self.above is not None and not whole:
+            ready = np.zeros(len(t_ns), bool) if above is None else t_ns <= above.t_ns[-1]
+        self.waiting = [(t_ns[~ready], turn[~ready])]
+        t_ns, turn = t_ns[ready], turn[ready]
+        if not t_ns.size:
+            return
+        start = np.zeros((len(t_ns), 3)) if above is None else above.at(t_ns)
+        end = start + rotated(turn, np.asarray(self.bone))
+        tip = self.tips.setdefault(self.segment or "", Tips())
+        tip.add(t_ns, end)
+        columns = rr.Transform3D.columns(
+            translation=start.astype(np.float32), quaternion=xyzw_from_wxyz(turn).astype(np.float32)
+        )
+        self.canvas.columns(self.at, t_ns, columns)
+
+
+class Tips:
+    """Where a segment ends, over the newest stretch of time: what hangs on it begins there."""
+
+    KEPT = 20_000
+
+    def __init__(self) -> None:
+        self.t_ns: Times = np.empty(0, dtype=np.int64)
+        self.places: Floats = np.empty((0, 3))
+
+    def add(self, t_ns: Times, places: Floats) -> None:
+        """Append places (n, 3), m."""
+        self.t_ns = np.concatenate([self.t_ns, t_ns])[-self.KEPT :]
+        self.places = np.concatenate([self.places, places])[-self.KEPT :]
+
+    def at(self, t_ns: Times) -> Floats:
+        """Return places (n, 3) at other times."""
+        zero = self.t_ns[0]
+        own, t = (self.t_ns - zero) / 1e9, (t_ns - zero) / 1e9
+        return np.column_stack([np.interp(t, own, p) for p in self.places.T])
+
+
+def tips_of(canvas: Canvas, figure: str) -> dict[str, Tips]:
+    """Return the ends of the segments of one figure."""
+    return canvas.store.setdefault(f"tips {figure}", {})
+
+
+def rotated(quat_wxyz: Floats, vector: Floats) -> Floats:
+    """Return a body vector (3,) in the navigation frame, for orientations (n, 4): shape (n, 3)."""
+    w, u = quat_wxyz[:, :1], quat_wxyz[:, 1:]
+    cross = np.cross(u, vector)
+    return vector + 2 * (w * cross + np.cross(u, cross))
+
+
+def segment_of(topic: str) -> str | None:
+    """Return the segment that an orientation's topic speaks of; None where it is no segment's.
+
+    ``/estimate/<run>/thigh``, ``/reference/left_shank``, ``/leg/thigh/orientation``,
+    ``/reference/thigh/orientation``, ``segment3``.
+    """
+    for part in reversed(topic.split("/")[1:]):
+        kind = split_side(part)[1]
+        if kind in BONES or (kind.startswith("segment") and kind[7:].strip("_").isdigit()):
+            return part
+    return None
+
+
+def split_side(name: str) -> tuple[str, str]:
+    """Return side and kind of a segment: ``left_thigh`` is ("left_", "thigh")."""
+    for side in ("left_", "right_", "l_", "r_"):
+        if name.startswith(side):
+            return side, name[len(side) :]
+    return "", name
+
+
+def bone_of(channel: ChannelLike, kind: str) -> tuple[float, float, float]:
+    """Return where a segment ends, (3,), m: as the channel's metadata says, else as is usual."""
+    try:
+        x, y, z = (float(channel.metadata[f"bone_{a}"]) for a in "xyz")
+    except (KeyError, ValueError):
+        return BONES.get(kind, OTHER_BONE)
+    return x, y, z
+
+
+def previous(canvas: Canvas, channel: ChannelLike) -> str | None:
+    """Return, for a numbered segment, the one before it in the same figure."""
+    name = segment_of(channel.topic) or ""
+    if not name.startswith("segment"):
+        return None
+    parent = canvas.group(channel.topic).rpartition("/")[0]
+    before = f"segment{name[7:].rstrip('0123456789')}{int(name[7:].strip('_')) - 1}"
+    there = [segment_of(c.topic) for c in canvas.channels if canvas.group(c.topic).startswith(parent)]
+    return before if before in there else None
+
+
+class Markers(View):
+    """Optical markers as named points in the figure, and their heights over time."""
+
+    title = "optical markers as points, and their heights"
+    schemas = ("marcha_msgs/msg/OpticalMarkers",)
+
+    def begin(self) -> None:
+        canvas = self.canvas
+        self.names = [c.removesuffix(".x") for c in self.channel.columns if c.endswith(".x")]
+        self.at = f"{self.path}/points"
+        canvas.static(self.at, rr.Points3D.from_fields(colors=style.rgb(self.color), radii=0.012))
+        canvas.show("space", self.at, tab=JOINTS, panel="markers", owner=self.owner)
+        colors = [style.run_color(i) for i in range(len(self.names))]
+        self.heights = f"{self.path}/height"
+        canvas.lines(self.heights, [f"{n} z (m)" for n in self.names], colors)
+        panel = f"{self.owner} heights of markers (m)"
+        canvas.show("plot", self.heights, tab=RAW, panel=panel, owner=self.owner)
+
+    def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
+        places = np.stack(
+            [columns_of(block, [f"{n}.{a}" for a in "xyz"]) for n in self.names], axis=1
+        )  # (rows, markers, 3)
+        self.canvas.scalars(self.heights, t_ns, places[:, :, 2])
+        seen = np.isfinite(places).all(axis=2)
+        counts = seen.sum(axis=1)
+        columns = rr.Points3D.columns(positions=places[seen].astype(np.float32)).partition(counts)
+        self.canvas.columns(self.at, t_ns, columns)

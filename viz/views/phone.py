@@ -1,0 +1,68 @@
+"""Views of phones outdoors: fixes on the map with their accuracy, tracks on the map."""
+
+# ruff: noqa: D102 - begin, draw and end are documented once, in View
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+import rerun as rr
+
+from .. import style
+from ..canvas import OVERVIEW, Floats, Times, columns_of
+from ..shapes import geo_circle
+from .common import General
+
+MAP = "map"
+SD = ("sd_east_m", "sd_north_m")
+
+
+class Fix(General):
+    """GNSS fixes on the map with a circle of one standard deviation each; all their numbers over time.
+
+    Fixes that an estimator states are joined to a track.
+    """
+
+    title = "fixes on the map with their accuracy, and their numbers over time"
+    schemas = ("sensor_msgs/msg/NavSatFix",)
+    needs = ("lat_deg", "lon_deg")
+    priority = 0
+
+    def begin(self) -> None:
+        super().begin()
+        canvas, color = self.canvas, style.rgb(style.AXES[2] if self.role == "raw" else self.color)
+        self.line: list[Floats] = []
+        self.points, self.circles = f"{self.path}/map/fixes", f"{self.path}/map/accuracy"
+        canvas.static(self.points, rr.GeoPoints.from_fields(colors=color, radii=rr.Radius.ui_points(4.0)))
+        canvas.show("map", self.points, tab=OVERVIEW, panel=MAP, owner=self.owner, past=True)
+        self.accuracy = set(SD) <= set(self.channel.columns)
+        if self.accuracy:
+            thin = rr.Radius.ui_points(0.7)
+            canvas.static(self.circles, rr.GeoLineStrings.from_fields(colors=(*color, 160), radii=thin))
+            canvas.show("map", self.circles, tab=OVERVIEW, panel=MAP, owner=self.owner)
+
+    def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
+        super().draw(t_ns, block)
+        place = columns_of(block, ["lat_deg", "lon_deg"])
+        good = np.flatnonzero(np.isfinite(place).all(axis=1))
+        place, t_ns, block = place[good], t_ns[good], block[good]
+        self.canvas.columns(self.points, t_ns, rr.GeoPoints.columns(positions=place))
+        if self.role != "raw":
+            self.line.append(place)
+        if self.accuracy:
+            sd = columns_of(block, SD)
+            known = np.isfinite(sd).all(axis=1) & (sd > 0).all(axis=1)
+            rings = geo_circle(place[known], sd[known])
+            columns = rr.GeoLineStrings.columns(line_strings=list(rings))
+            self.canvas.columns(self.circles, t_ns[known], columns)
+
+    def end(self) -> None:
+        super().end()
+        if self.line:
+            line = np.concatenate(self.line)
+            if len(line) > 1:
+                at = f"{self.path}/map/track"
+                width = rr.Radius.ui_points(2.0)
+                track = rr.GeoLineStrings(lat_lon=[line], colors=style.rgb(self.color), radii=width)
+                self.canvas.static(at, track)
+                self.canvas.show("map", at, tab=OVERVIEW, panel=MAP, owner=self.owner)
