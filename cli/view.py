@@ -16,6 +16,7 @@ def view(
     *paths: Path,
     web: bool = False,
     rrd: Annotated[Path | None, Parameter(name="--rrd")] = None,
+    online: bool = False,
     force: Force = False,
     common: Common = DEFAULT,
 ) -> Outcome:
@@ -29,6 +30,8 @@ def view(
         Serve the viewer for a web browser instead of opening a window.
     rrd : Path
         Write a Rerun file instead of opening a viewer.
+    online : bool
+        Let the viewer reach other hosts: tiles of maps, and Rerun's own reports of its use.
     force : bool
         Replace an existing Rerun file.
     """
@@ -43,7 +46,12 @@ def view(
     if rrd is not None:
         viz.write_rrd(recs, rrd, overwrite=force)
     else:
-        viz.show(recs, web=web, opened=lambda window: complain(f"the viewer is at {window.address}"))
+        viz.show(
+            recs,
+            web=web,
+            online=online,
+            opened=lambda window: complain(f"the viewer is at {window.address}"),
+        )
     say_losses(*recs)
     document = {"paths": [str(p) for p in paths], "rrd": str(rrd) if rrd else None, "web": web}
     return Outcome(document, [Heading(f"wrote {rrd}")] if rrd else [])

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import io
 import os
+import signal
 import socket
+import subprocess
+import sys
 import urllib.request
 from pathlib import Path
 
@@ -65,7 +68,7 @@ def test_a_replay_is_seen_live(rrd: Path, monkeypatch: pytest.MonkeyPatch) -> No
     from rerun.experimental import ViewerClient
 
     native = viewer.native
-    monkeypatch.setattr(viewer, "native", lambda: native(headless=True))
+    monkeypatch.setattr(viewer, "native", lambda online: native(headless=True))
     sink = viz.LiveSink(show=True)
     rp.replay(mr.open(rrd.parent / "walk.mcap"), ["foot.9iez"], sinks=[sink])
     (window,) = sink.viewers
@@ -95,9 +98,74 @@ def test_the_web_viewer_serves_this_machine_only_and_ends() -> None:
     assert not alive, gone
 
 
+def test_the_page_of_the_web_viewer_may_talk_to_no_other_host() -> None:
+    with viewer.web(open_browser=False) as window:
+        answer = urllib.request.urlopen(window.address, timeout=10)
+        rules = dict(r.strip().split(" ", 1) for r in answer.headers["Content-Security-Policy"].split(";"))
+        page = answer.read().decode()
+        assert "https://" in page  # Rerun's page asks for fonts and counts visits: that is why
+        allowed = {source for sources in rules.values() for source in sources.split()}
+        here = {f"http://{name}:{window.port}" for name in ("127.0.0.1", "localhost")}
+        assert {source for source in allowed if "//" in source} == here
+        assert rules["default-src"] == "'none'"
+        wasm = urllib.request.urlopen(window.address.partition("?")[0] + "re_viewer_bg.wasm", timeout=10)
+        assert wasm.read(4) == b"\0asm"
+
+
+def test_a_viewer_is_told_of_no_way_out_unless_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    class Process:
+        stdin = None
+
+        def __init__(self, command: list[str], env: dict[str, str], **_: object) -> None:
+            seen.append(env)
+
+        def poll(self) -> int:
+            return 1
+
+    monkeypatch.setattr(viewer.subprocess, "Popen", Process)
+    monkeypatch.delenv("HTTPS_PROXY", raising=False)
+    for online in (False, True):
+        with pytest.raises(MarchaError):
+            viewer.native(headless=True, online=online)
+    assert seen[0]["HTTPS_PROXY"] == seen[0]["https_proxy"] == viewer.NOWHERE
+    assert "HTTPS_PROXY" not in seen[1]
+
+
+def started(code: str) -> tuple[subprocess.Popen[str], list[psutil.Process]]:
+    """Start a program that opens the web viewer and waits; return it and the processes below it."""
+    environment = {**os.environ, "BROWSER": "true"}
+    command = [sys.executable, "-c", code]
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+    assert program.stdout is not None
+    assert program.stdout.readline().startswith("http://127.0.0.1:")
+    return program, psutil.Process(program.pid).children(recursive=True)
+
+
+WAITING = (
+    "import sys, marcha.recording as mr, marcha.viz as viz\n"
+    "viz.show(mr.open({path!r}), web=True, open_browser=False, "
+    "opened=lambda w: print(w.address, flush=True))\n"
+)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGKILL"])
+def test_nothing_is_left_of_the_web_viewer_when_its_program_is_ended(rrd: Path, name: str) -> None:
+    program, family = started(WAITING.format(path=str(rrd.parent / "walk.mcap")))
+    assert len(family) >= 2
+    program.send_signal(getattr(signal, name))
+    program.wait(timeout=5)
+    _, alive = psutil.wait_procs(family, timeout=5)
+    for process in alive:
+        process.kill()
+    assert not alive
+
+
 def test_a_viewer_that_cannot_start_says_why() -> None:
     with socket.socket() as taken:
         taken.bind((viewer.HOST, 0))
         port = taken.getsockname()[1]
         with pytest.raises(MarchaError, match=r"did not start: .*wrong-option"):
-            viewer.Viewer(["--wrong-option"], port)
+            viewer.Viewer([*viewer.RERUN, "--wrong-option"], port)

@@ -26,6 +26,7 @@ def show(
     wait: bool | None = None,
     *,
     open_browser: bool = True,
+    online: bool = False,
     opened: Callable[[Viewer], object] | None = None,
 ) -> Viewer:
     """Open recordings in the viewer.
@@ -41,6 +42,8 @@ def show(
         stays open by itself, and the web viewer is waited for.
     open_browser : bool
         Whether to open a browser window by itself.
+    online : bool
+        Whether the viewer may reach other hosts (tiles of maps, Rerun's reports of its use).
     opened : callable, optional
         Called with the viewer once it runs, for example to print its ``address``.
 
@@ -62,7 +65,10 @@ def show(
     from .stream import finish, new_stream, release
 
     recs = [recs] if isinstance(recs, Recording) else list(recs)
-    window = viewer.web(open_browser=open_browser) if web else viewer.native()
+    if web:
+        window = viewer.web(open_browser=open_browser, online=online)
+    else:
+        window = viewer.native(online=online)
     try:
         if opened is not None:
             opened(window)
@@ -99,6 +105,8 @@ class LiveSink:
         Whether an earlier file may be replaced.
     open_browser : bool
         Whether the web viewer opens a browser window by itself.
+    online : bool
+        Whether viewers may reach other hosts.
 
     Attributes
     ----------
@@ -114,11 +122,13 @@ class LiveSink:
         web: bool = False,
         overwrite: bool = False,
         open_browser: bool = True,
+        online: bool = False,
     ) -> None:
         if path is None and not show and not web:
             raise UsageError("a live view needs a file, a viewer or the web viewer")
         self._path = None if path is None else Path(path)
         self._show, self._web, self._overwrite, self._browser = show, web, overwrite, open_browser
+        self._online = online
         self._file: AtomicFile | None = None
         self._scene: Scene | None = None
         self._held: dict[str, list[pl.DataFrame]] = {}
@@ -138,9 +148,9 @@ class LiveSink:
                 self._file = AtomicFile(self._path, overwrite=self._overwrite)
                 sinks.append(rr.FileSink(self._file.part))
             if self._show:
-                self.viewers.append(viewer.native())
+                self.viewers.append(viewer.native(online=self._online))
             if self._web:
-                self.viewers.append(viewer.web(open_browser=self._browser))
+                self.viewers.append(viewer.web(open_browser=self._browser, online=self._online))
             sinks += [rr.GrpcSink(viewer.uri(v.port)) for v in self.viewers]
             self._stream = new_stream()
             self._stream.set_sinks(*sinks)

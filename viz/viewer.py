@@ -2,6 +2,10 @@
 
 Rerun's own ``spawn`` and ``serve_web_viewer`` bind all interfaces of the machine, so the bundled program
 is started here with ``--bind 127.0.0.1``.
+
+What is seen may be a patient's: unless asked for (``online``), the viewer reaches no other host. Rerun reports
+its use, asks for map tiles and loads fonts; the native program is told of a proxy that does not exist, the web
+page has a content security policy (:mod:`marcha.viz.webpage`).
 """
 
 from __future__ import annotations
@@ -13,13 +17,18 @@ import subprocess
 import sys
 import tempfile
 import time
+import webbrowser
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Self
 from urllib.parse import quote
 
 from ..recording.errors import MarchaError, UsageError
 
 HOST = "127.0.0.1"
+NOWHERE = f"http://{HOST}:9"
+"""A proxy that does not exist (9 is the port of the discard service)."""
+
 PATIENCE_S = 30.0
 """How long a viewer may take until it listens."""
 
@@ -36,6 +45,10 @@ def uri(port: int) -> str:
     return f"rerun+http://{HOST}:{port}/proxy"
 
 
+RERUN = (sys.executable, "-m", "rerun_cli")
+WEBPAGE = Path(__file__).with_name("webpage.py")
+
+
 class Viewer:
     """A running viewer process; a context manager that ends it.
 
@@ -47,31 +60,58 @@ class Viewer:
         What to open in a browser; of the native viewer, where it takes data.
     """
 
-    def __init__(self, arguments: Sequence[str], port: int, address: str = "") -> None:
+    def __init__(
+        self,
+        command: Sequence[str],
+        port: int,
+        *,
+        address: str = "",
+        listens: Sequence[int] = (),
+        tied: bool = False,
+        online: bool = False,
+    ) -> None:
+        """Start a process and wait until it listens.
+
+        Parameters
+        ----------
+        command : sequence of str
+            Program and arguments.
+        port : int
+            Where it will listen for data.
+        address : str
+            See above.
+        listens : sequence of int
+            Further ports that it will listen on.
+        tied : bool
+            Whether it ends when this program ends, in whatever way: its standard input closes then.
+        online : bool
+            Whether it may reach other hosts.
+        """
         self.port, self.address = port, address or uri(port)
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 - it lives as long as the process
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "rerun_cli", *arguments],
+            list(command),
             stdout=self._said,
             stderr=self._said,
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE if tied else subprocess.DEVNULL,
             start_new_session=True,  # one group to end, and it may outlive us
-            env={**os.environ, "RERUN_APP_ONLY": "true"},
+            env={**os.environ, "RERUN_APP_ONLY": "true", **({} if online else offline())},
         )
-        self._wait_until_it_listens()
+        for one in (port, *listens):
+            self._wait_until_it_listens(one)
 
-    def _wait_until_it_listens(self) -> None:
+    def _wait_until_it_listens(self, port: int) -> None:
         until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until and self._process.poll() is None:
             try:
-                socket.create_connection((HOST, self.port), timeout=1.0).close()
+                socket.create_connection((HOST, port), timeout=1.0).close()
             except OSError:
                 time.sleep(0.02)
             else:
                 return
-        self.close()
         self._said.seek(0)
         lines = [line for line in self._said.read().decode(errors="replace").splitlines() if line.strip()]
+        self.close()
         lines = [line for line in lines if "error" in line.lower()] or lines or ["it said nothing"]
         raise MarchaError(f"the Rerun viewer did not start: {lines[0]}")
 
@@ -86,16 +126,21 @@ class Viewer:
 
     def close(self) -> None:
         """End the process and what it started."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
         if self._process.poll() is None:
             if os.name == "posix":
                 os.killpg(self._process.pid, signal.SIGTERM)
             else:  # /T takes the children too
                 subprocess.run(["taskkill", "/PID", str(self._process.pid), "/T", "/F"], capture_output=True)
             try:
-                self._process.wait(5.0)
+                self._process.wait(1.0)
             except subprocess.TimeoutExpired:
+                if os.name == "posix":
+                    os.killpg(self._process.pid, signal.SIGKILL)
                 self._process.kill()
                 self._process.wait()
+        self._said.close()
 
     def __enter__(self) -> Self:
         return self
@@ -104,8 +149,25 @@ class Viewer:
         self.close()
 
 
-def native(*, headless: bool = False, size: tuple[int, int] | None = None) -> Viewer:
+def offline() -> dict[str, str]:
+    """Return environment variables under which a program finds no other host."""
+    names = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY")
+    here = f"{HOST},localhost"
+    found = {"NO_PROXY": here, "no_proxy": here}
+    return {**dict.fromkeys(names, NOWHERE), **{n.lower(): NOWHERE for n in names}, **found}
+
+
+def native(*, headless: bool = False, size: tuple[int, int] | None = None, online: bool = False) -> Viewer:
     """Start the native viewer, waiting for data on a port of its own.
+
+    Parameters
+    ----------
+    headless : bool
+        Without a window.
+    size : (int, int), optional
+        Width and height, pixels.
+    online : bool
+        Whether it may reach other hosts: tiles of maps, and Rerun's own reports of use.
 
     Raises
     ------
@@ -121,18 +183,31 @@ def native(*, headless: bool = False, size: tuple[int, int] | None = None) -> Vi
     flags = ["--headless"] if headless else ["--expect-data-soon"]
     if size is not None:
         flags += ["--window-size", f"{size[0]}x{size[1]}"]
-    return Viewer(["--bind", HOST, "--port", str(port), "--hide-welcome-screen", *flags], port)
+    command = [*RERUN, "--bind", HOST, "--port", str(port), "--hide-welcome-screen", *flags]
+    return Viewer(command, port, online=online)
 
 
-def web(*, open_browser: bool = True) -> Viewer:
-    """Start the web viewer, waiting for data on a port of its own; it serves browsers of this machine.
+def web(*, open_browser: bool = True, online: bool = False) -> Viewer:
+    """Start the web viewer, waiting for data on a port of its own; it serves browsers of this machine, and
+    ends with this program.
+
+    Parameters
+    ----------
+    open_browser : bool
+        Whether to open a browser window.
+    online : bool
+        Whether the page may reach other hosts.
 
     Raises
     ------
     MarchaError
         It did not start.
     """
-    port, page = free_port(), free_port()
-    mode = "--web-viewer" if open_browser else "--serve-web"
-    arguments = [mode, "--bind", HOST, "--port", str(port), "--web-viewer-port", str(page)]
-    return Viewer(arguments, port, f"http://{HOST}:{page}?url={quote(uri(port), safe='')}")
+    port, page, inner = free_port(), free_port(), free_port()
+    rerun = [*RERUN, "--serve-web", "--bind", HOST, "--port", str(port), "--web-viewer-port", str(inner)]
+    ours = [sys.executable, str(WEBPAGE), str(page), str(inner), "0" if online else str(port)]
+    shown = f"http://{HOST}:{page}/?url={quote(uri(port), safe='')}"
+    viewer = Viewer([*ours, *rerun], port, address=shown, listens=(page, inner), tied=True, online=online)
+    if open_browser:
+        webbrowser.open(shown)
+    return viewer
