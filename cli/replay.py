@@ -166,6 +166,7 @@ def evaluate(
     run: Annotated[Strings, Parameter(name="--run")] = (),
     alignment: Annotated[Literal["none", "origin", "origin-yaw", "se2", "se3"], Shown] = "se3",
     reference: str | None = None,
+    truth: Strings = (),
     common: Common = DEFAULT,
 ) -> Outcome:
     """Measure the estimates of a replayed recording.
@@ -184,7 +185,10 @@ def evaluate(
         How a track is laid on the reference: as it is, first position, also first heading, least squares
         over turn about the vertical and shift, or over all rotations and shift.
     reference : str
-        Topic of the reference track, where several would fit.
+        Topic of a reference, where several would fit.
+    truth : str
+        What is known of the walk beside what the recording says: closed=true, length_m=22.1, steps=63; may be
+        repeated.
     """
     import msgspec
 
@@ -193,7 +197,13 @@ def evaluate(
 
     bounds = limits(maximum, "--max"), limits(minimum, "--min")
     rec = recording.open(path)
-    evaluation = rp.evaluate(rec, runs=list(run) or None, alignment=alignment, reference=reference)
+    evaluation = rp.evaluate(
+        rec,
+        runs=list(run) or None,
+        alignment=alignment,
+        reference=reference,
+        truth={k: str(v).lower() for k, v in settings(truth, "--truth").items()},
+    )
     say_losses(rec)
     missed = rp.check_thresholds(evaluation, *bounds)
     runs = msgspec.to_builtins(evaluation.runs)

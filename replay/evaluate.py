@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import msgspec
 import polars as pl
@@ -12,9 +12,7 @@ import polars as pl
 from ..recording import Recording
 from ..recording.errors import MarchaError, UsageError
 from .metrics import RunView, Truth, available_metrics
-
-OWN_TIERS = ("stance", "step")
-"""Tiers that a replay itself writes, as ``<run>/<tier>``."""
+from .references import reference_of
 
 
 class IntervalEvaluation(msgspec.Struct):
@@ -107,6 +105,7 @@ def evaluate(
     max_gap_s: float = 0.1,
     reference: str | None = None,
     intervals: bool = True,
+    truth: Mapping[str, str] | None = None,
 ) -> Evaluation:
     """Measure every run of a replayed recording.
 
@@ -121,10 +120,12 @@ def evaluate(
     max_gap_s : float
         Reference samples farther apart are not interpolated between.
     reference : str, optional
-        Topic of the reference track. Without it the one named like the run's input (``/reference/imu2/pose``
-        for ``/foot/imu2``), else ``/reference/pose``, else the only pose below ``/reference/``.
+        Topic of a reference. Without it the one named like the run's input (``/reference/imu2/pose``
+        for ``/foot/imu2``), else ``/reference/pose``, else the only one of its kind below ``/reference/``.
     intervals : bool
         Whether annotated intervals are measured too.
+    truth : mapping, optional
+        What is known of the walk beside what the recording says: ``closed``, ``length_m``, ``steps``.
 
     Returns
     -------
@@ -148,12 +149,18 @@ def evaluate(
             raise UsageError(f"{rec.path}: no run {run}; there are {', '.join(lineages)}")
     views = [
         recording_view(
-            rec, {"run": run, **lineage}, None, alignment=alignment, max_gap_s=max_gap_s, reference=reference
+            rec,
+            {"run": run, **lineage},
+            None,
+            alignment=alignment,
+            max_gap_s=max_gap_s,
+            reference=reference,
+            truth=truth,
         )
         for run, lineage in lineages.items()
         if runs is None or run in runs
     ]
-    marked = _intervals(rec.annotations) if intervals else pl.DataFrame()
+    marked = _intervals(rec.annotations, lineages) if intervals else pl.DataFrame()
     return Evaluation([evaluate_run(view, marked) for view in views])
 
 
@@ -167,6 +174,7 @@ def recording_view(
     alignment: str = "se3",
     max_gap_s: float = 0.1,
     reference: str | None = None,
+    truth: Mapping[str, str] | None = None,
 ) -> RunView:
     """Return what the metrics of one run look at: its tables in memory, or those of the recording.
 
@@ -180,7 +188,7 @@ def recording_view(
         Results by output.
     start_ns, end_ns : int, optional
         Range of the replay; a walk's length says nothing of a part of it.
-    alignment, max_gap_s, reference
+    alignment, max_gap_s, reference, truth
         As in :func:`evaluate`.
     """
     run = lineage["run"]
@@ -199,19 +207,33 @@ def recording_view(
     start_ns = start_ns if start_ns is not None else _number(lineage.get("range.start_ns"))
     end_ns = end_ns if end_ns is not None else _number(lineage.get("range.end_ns"))
     whole = start_ns is None and end_ns is None
-    pose = _reference_topic(rec, lineage.get("input", ""), reference) if rec is not None else None
-    velocity = None if pose is None else pose.rpartition("/")[0] + "/velocity"
+    known = {**(rec.metadata.get("truth", {}) if rec is not None else {}), **(truth or {})}
+    topics = _track_references(rec, lineage.get("input", ""), reference) if rec is not None else (None, None)
+    track, velocity = topics
     return RunView(
         run=run,
         estimator=lineage.get("estimator", ""),
         lineage=lineage,
         output=output,
-        truth=truth_of(rec.metadata) if rec is not None and whole else Truth(),
-        reference=rec.table(pose) if rec is not None and pose is not None else None,
-        reference_velocity=rec.table(velocity) if rec is not None and velocity in rec.channels else None,
+        truth=truth_of({"truth": known}) if whole else Truth(),
+        reference=rec.table(track) if rec is not None and track is not None else None,
+        reference_velocity=rec.table(velocity) if rec is not None and velocity is not None else None,
+        recording=rec,
+        chosen_reference=reference,
         alignment=alignment,
         max_gap_s=max_gap_s,
     )
+
+
+def _track_references(rec: Recording, input_topic: str, chosen: str | None) -> tuple[str | None, str | None]:
+    """Return the topics of the reference track (poses before positions) and of the velocity beside it."""
+    track = reference_of(rec.channels, "pose", input_topic, chosen, str(rec.path))
+    if track is None:
+        track = reference_of(rec.channels, "position", input_topic, chosen, str(rec.path))
+    if track is None:
+        return None, None
+    beside = track.rpartition("/")[0] + "/velocity"
+    return track, beside if beside in rec.channels else None
 
 
 def evaluate_run(view: RunView, intervals: pl.DataFrame | None = None) -> RunEvaluation:
@@ -281,11 +303,21 @@ def truth_of(records: Mapping[str, Mapping[str, str]]) -> Truth:
     """Return what a recording's metadata record ``truth`` knows of the walk."""
     record = records.get("truth", {})
     closed = record.get("closed", "").lower()
+    return Truth(
+        {"true": True, "false": False}.get(closed),
+        _truth_number(record, "length_m"),
+        _truth_number(record, "steps"),
+    )
+
+
+def _truth_number(record: Mapping[str, str], name: str) -> float | None:
     try:
-        length = float(record["length_m"]) if record.get("length_m") else None
+        value = float(record[name]) if record.get(name) else None
     except ValueError:
-        raise MarchaError(f"metadata record truth: length_m {record['length_m']!r} is no number") from None
-    return Truth({"true": True, "false": False}.get(closed), length)
+        value = float("nan")
+    if value is not None and not value > 0:
+        raise MarchaError(f"metadata record truth: {name} {record[name]!r} is no number above 0")
+    return value
 
 
 def _some(table: pl.DataFrame, columns: Sequence[str]) -> pl.DataFrame:
@@ -313,31 +345,10 @@ def _matched(view: RunView) -> tuple[int, int]:
     return len(compared.matches.index), compared.matches.dropped
 
 
-def _intervals(annotations: pl.DataFrame) -> pl.DataFrame:
-    """Return the annotations that are intervals and that no replay wrote."""
-    own = pl.col("tier").str.contains(rf"/(?:{'|'.join(OWN_TIERS)})$")
+def _intervals(annotations: pl.DataFrame, runs: Collection[str]) -> pl.DataFrame:
+    """Return the annotations that are intervals and that no run wrote (``<run>/<tier>``)."""
+    own = pl.col("tier").str.split("/").list.first().is_in(list(runs))
     return annotations.filter((pl.col("end_ns") > pl.col("start_ns")) & ~own)
-
-
-def _reference_topic(rec: Recording, input_topic: str, chosen: str | None) -> str | None:
-    """Return the reference: of ``/foot/imu2``, ``/reference/imu2/pose`` before ``/reference/pose``."""
-    poses = [
-        t
-        for t, c in rec.channels.items()
-        if t.startswith("/reference/") and c.schema == "geometry_msgs/msg/PoseStamped"
-    ]
-    if chosen is not None:
-        if chosen not in poses:
-            raise UsageError(f"{rec.path}: no reference {chosen}; there are {', '.join(poses) or 'none'}")
-        return chosen
-    parts = [p for p in input_topic.split("/") if p]
-    for i in range(len(parts) + 1):
-        own = "/".join(("", "reference", *parts[i:], "pose"))
-        if own in poses:
-            return own
-    if len(poses) > 1:
-        raise UsageError(f"{rec.path}: several references ({', '.join(poses)}) for {input_topic}; name one")
-    return poses[0] if poses else None
 
 
 def _number(text: str | None) -> int | None:

@@ -7,27 +7,24 @@ metric that applies but has no value is NaN. ``docs/replay.md`` lists every name
 
 from __future__ import annotations
 
+import json
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from importlib import metadata
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import polars as pl
 
 from ..algorithms.contract import FloatArray
-from .alignment import (
-    IntArray,
-    Matches,
-    Transform,
-    align,
-    match,
-    wrap,
-    yaw_of,
-)
+from .alignment import IntArray, Matches, Transform, align, match, wrap, yaw_of
+from .references import reference_of, references
+
+if TYPE_CHECKING:
+    from ..recording import Recording
 
 POSITION = ("pos_x", "pos_y", "pos_z")
 QUATERNION = ("quat_w", "quat_x", "quat_y", "quat_z")
@@ -90,10 +87,13 @@ class Truth:
         Whether it ends where it began; None where that is not known.
     length_m : float or None
         Its length.
+    steps : float or None
+        Number of its steps.
     """
 
     closed: bool | None = None
     length_m: float | None = None
+    steps: float | None = None
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,12 @@ class RunView:
     truth : Truth
         What is known of the walk.
     reference, reference_velocity : polars.DataFrame or None
-        Tables of the reference, in the recording's columns.
+        Tables of the reference track (poses or positions), in the recording's columns.
+    recording : Recording or None
+        For raw channels, further references, annotations and attachments: see :meth:`raw`,
+        :meth:`reference_table`, :attr:`annotations`.
+    chosen_reference : str or None
+        Topic that the user named.
     alignment : str
         See :func:`marcha.replay.alignment.align`.
     max_gap_s : float
@@ -162,6 +167,8 @@ class RunView:
     truth: Truth = Truth()
     reference: pl.DataFrame | None = None
     reference_velocity: pl.DataFrame | None = None
+    recording: Recording | None = None
+    chosen_reference: str | None = None
     alignment: str = "se3"
     max_gap_s: float = 0.1
     start_ns: int | None = None
@@ -173,6 +180,60 @@ class RunView:
         if (name, columns) not in self._cache:
             self._cache[name, columns] = self.output(name, columns)
         return self._within(self._cache[name, columns])
+
+    @property
+    def inputs(self) -> dict[str, tuple[str, ...]]:
+        """Topics by the name of the run's input."""
+        found = json.loads(self.lineage.get("inputs", "{}"))
+        return {name: tuple(topics) for name, topics in found.items()} if isinstance(found, dict) else {}
+
+    @property
+    def output_schemas(self) -> dict[str, str]:
+        """Message types by the name of the run's output, where a recording holds them."""
+        if self.recording is None:
+            return {}
+        start = f"/estimate/{self.run}/"
+        channels = self.recording.channels.items()
+        return {t.removeprefix(start): c.schema for t, c in channels if t.startswith(start)}
+
+    def raw(self, topic: str) -> pl.DataFrame | None:
+        """Return a channel of the recording within the interval; None where it is not there."""
+        if self.recording is None or topic not in self.recording.channels:
+            return None
+        return self._within(self.recording.table(topic))
+
+    def reference_table(self, kind: str) -> pl.DataFrame | None:
+        """Return the run's reference of a kind (``pose``, ``position``, ``fix``, ``joint``, ``steps`` …) within
+        the interval; None where there is none.
+        """
+        if self.recording is None:
+            return self._within(self.reference) if kind == "pose" else None
+        topic = reference_of(
+            self.recording.channels,
+            kind,
+            self.lineage.get("input", ""),
+            self.chosen_reference,
+            str(self.recording.path),
+        )
+        return None if topic is None else self.raw(topic)
+
+    def reference_tables(self, kind: str) -> dict[str, pl.DataFrame]:
+        """Return all references of a kind within the interval, by topic (one a segment, say)."""
+        if self.recording is None:
+            return {}
+        found = {t: self.raw(t) for t in references(self.recording.channels, kind)}
+        return {t: table for t, table in found.items() if table is not None}
+
+    @property
+    def annotations(self) -> pl.DataFrame:
+        """All annotations of the recording."""
+        return self.recording.annotations if self.recording is not None else pl.DataFrame()
+
+    def attachment(self, name: str) -> bytes | None:
+        """Return an attachment of the recording; None where it is not there."""
+        if self.recording is None or name not in [a.name for a in self.recording.attachments]:
+            return None
+        return self.recording.attachment(name)
 
     def _within(self, table: pl.DataFrame | None) -> pl.DataFrame | None:
         if table is None or (self.start_ns is None and self.end_ns is None):
@@ -189,9 +250,10 @@ class RunView:
 
     @cached_property
     def track(self) -> Track | None:
-        """The estimated track."""
+        """The estimated track: of the output ``pose``, else of ``position``."""
         headings = QUATERNION if self.reference is not None else ()
-        return track_of(self.table("pose", (*POSITION, *headings)))
+        track = track_of(self.table("pose", (*POSITION, *headings)))
+        return track if track is not None else track_of(self.table("position", POSITION))
 
     @cached_property
     def reference_track(self) -> Track | None:
@@ -270,6 +332,8 @@ def distance(view: RunView) -> dict[str, float]:
     steps = view.table("step")
     if steps is not None:
         found["steps"] = float(steps.height)
+        if view.truth.steps:
+            found["steps_error_percent"] = 100.0 * abs(steps.height - view.truth.steps) / view.truth.steps
     if (length := view.truth.length_m) is not None:
         for name, metres in (
             ("distance_error_percent", found.get("distance_m")),
@@ -307,6 +371,9 @@ def reference(view: RunView) -> dict[str, float]:
     found = {
         "ate_rmse_m": float(np.sqrt(np.mean(error**2))),
         "position_error_mean_m": float(error.mean()),
+        "position_error_median_m": float(np.median(error)),
+        "position_error_p75_m": float(np.percentile(error, 75)),
+        "position_error_p95_m": float(np.percentile(error, 95)),
         "position_error_max_m": float(error.max()),
         "position_error_end_m": float(error[-1]),
     }

@@ -1,0 +1,78 @@
+"""Which reference belongs to a run: decided here, for evaluation, viewer and figures alike.
+
+References lie below ``/reference/``. Of a kind (its message type), the one that is called like the run's input
+counts: ``/reference/imu2/pose`` for ``/foot/imu2``, then ``/reference/pose``, then the only one of its kind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from ..recording.errors import UsageError
+
+PREFIX = "/reference/"
+KINDS: dict[str, tuple[str, ...]] = {
+    "pose": ("geometry_msgs/msg/PoseStamped",),
+    "position": ("geometry_msgs/msg/PointStamped",),
+    "fix": ("sensor_msgs/msg/NavSatFix",),
+    "joint": ("sensor_msgs/msg/JointState",),
+    "orientation": ("geometry_msgs/msg/QuaternionStamped",),
+    "steps": ("marcha_msgs/msg/Step",),
+    "velocity": ("geometry_msgs/msg/Vector3Stamped", "geometry_msgs/msg/TwistStamped"),
+    "markers": ("marcha_msgs/msg/OpticalMarkers",),
+}
+"""Message types of a kind of reference."""
+
+
+class _Channel(Protocol):
+    @property
+    def schema(self) -> str: ...
+
+
+def references(channels: Mapping[str, _Channel], kind: str) -> list[str]:
+    """Return the topics of all references of a kind."""
+    if kind not in KINDS:
+        raise UsageError(f"no kind of reference {kind!r}; there are {', '.join(KINDS)}")
+    return [t for t, c in channels.items() if t.startswith(PREFIX) and c.schema in KINDS[kind]]
+
+
+def reference_of(
+    channels: Mapping[str, _Channel], kind: str, input_topic: str, chosen: str | None = None, name: str = ""
+) -> str | None:
+    """Return the topic of the reference of a kind that belongs to a run, None where there is none.
+
+    Parameters
+    ----------
+    channels : mapping
+        Of the recording, by topic.
+    kind : str
+        One of :data:`KINDS`.
+    input_topic : str
+        Topic of the run's first input.
+    chosen : str, optional
+        Topic that the user named; it counts for its own kind.
+    name : str
+        Of the recording, for messages.
+
+    Raises
+    ------
+    UsageError
+        ``chosen`` is no reference, or several fit and none is called like the input.
+    """
+    fitting = references(channels, kind)
+    if chosen is not None:
+        known = [t for t in channels if t.startswith(PREFIX)]
+        if chosen not in known:
+            raise UsageError(f"{name}: no reference {chosen}; there are {', '.join(known) or 'none'}")
+        if chosen in fitting:
+            return chosen
+    parts = [p for p in input_topic.split("/") if p]
+    for i in range(len(parts) + 1):
+        own = [t for t in fitting if t.rpartition("/")[0] == "/".join(("", "reference", *parts[i:]))]
+        own = [t for t in own if t.endswith(f"/{kind}")] or own
+        if len(own) == 1:
+            return own[0]
+    if len(fitting) > 1:
+        raise UsageError(f"{name}: several references ({', '.join(fitting)}) for {input_topic}; name one")
+    return fitting[0] if fitting else None
