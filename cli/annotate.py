@@ -1,12 +1,13 @@
-"""``marcha annotate add|import|list``: labelled intervals; a file is never changed in place."""
+"""``marcha annotate``: labelled intervals and instants; a file is never changed in place."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 from cyclopts import App, Parameter
 
+from .changes import WHERE, Where, diff, log, redo, rules, said, undo, vocabulary, write
 from .console import (
     Heading,
     Outcome,
@@ -19,25 +20,21 @@ from .options import (
     QUIET,
     Common,
     Force,
-    MaybeOutput,
+    Output,
     Shown,
     Strings,
     instant,
     settings,
 )
 
-if TYPE_CHECKING:
-    import polars as pl
-
-    from ..recording import Recording
-
 app = App(
     name="annotate",
-    help="Add, import or list labelled intervals of a recording.",
+    help="Add, change, import, export, list or compare annotations of a recording.",
     default_parameter=QUIET,
 )
 
-InPlace = Annotated[bool, Parameter(name="--in-place", negative="")]
+
+Tier = Annotated[str | None, Parameter(name="--tier")]
 
 
 @app.command
@@ -49,10 +46,12 @@ def add(
     start: Annotated[str, Parameter(name="--from")],
     end: Annotated[str | None, Parameter(name="--to")] = None,
     tier: Annotated[str, Shown] = "manual",
+    note: str | None = None,
+    confidence: float | None = None,
+    channel: str | None = None,
+    source: str | None = None,
     meta: Annotated[Strings, Parameter(name="--meta")] = (),
-    output: MaybeOutput = None,
-    in_place: InPlace = False,
-    force: Force = False,
+    where: Where = WHERE,
     common: Common = DEFAULT,
 ) -> Outcome:
     """Add one annotation.
@@ -66,23 +65,26 @@ def add(
     start : str
         When it began: 12.5, 12.5s, 1m, 500ms after the recording's start, or @NANOSECONDS of its clock.
     end : str
-        When it ended; written like --from. The same moment without it.
+        When it ended; written like --from. An instant without it.
     tier : str
         Kind of annotation; becomes /annotation/TIER.
+    note : str
+        Remark.
+    confidence : float
+        How sure, between 0 and 1.
+    channel : str
+        Topic or segment that it speaks of.
+    source : str
+        Who says so; human:NAME with the name of --by otherwise.
     meta : str
         key=value of the annotation; may be repeated.
-    output : Path
-        New recording to write.
-    in_place : bool
-        Put the finished copy in the place of the recording.
-    force : bool
-        Replace an existing output.
     """
     import msgspec
     import polars as pl
 
     from .. import recording
-    from ..export.events import ANNOTATIONS
+    from ..recording.annotations import COLUMNS
+    from ..recording.changes import user
     from ..recording.errors import UsageError
 
     rec = recording.open(path)
@@ -92,9 +94,112 @@ def add(
         raise UsageError(
             f"annotate add: from {start} to {end} is not an interval; the end is not before the start"
         )
-    metadata = msgspec.json.encode(settings(meta, "--meta")).decode()
-    table = pl.DataFrame([[tier], [start_ns], [end_ns], [label], [metadata]], schema=ANNOTATIONS)
-    return _write(rec, table, output, in_place=in_place, force=force)
+    row = {
+        "tier": tier,
+        "start_ns": start_ns,
+        "end_ns": end_ns,
+        "label": label,
+        "metadata": msgspec.json.encode(settings(meta, "--meta")).decode(),
+        "source": source or f"human:{where.by or user()}",
+        "confidence": confidence,
+        "note": note,
+        "channel": channel,
+    }
+    return write(rec, where, add=pl.DataFrame([row], schema=COLUMNS), action="add")
+
+
+@app.command
+def remove(
+    path: Path,
+    /,
+    *ids: str,
+    tier: Tier = None,
+    where: Where = WHERE,
+    common: Common = DEFAULT,
+) -> Outcome:
+    """Remove annotations.
+
+    Parameters
+    ----------
+    path : Path
+        The recording.
+    ids : str
+        Ids (marcha annotate list), or their beginnings.
+    tier : str
+        All annotations of this tier.
+    """
+    from .. import recording
+    from ..recording.changes import find
+    from ..recording.errors import UsageError
+
+    rec = recording.open(path)
+    gone = find(rec, ids)
+    if tier is not None:
+        gone += rec.annotations.filter(tier=tier)["id"].to_list()
+    if not gone:
+        raise UsageError(f"{path}: annotate remove: nothing is named; give ids or --tier of what is there")
+    return write(rec, where, remove=tuple(dict.fromkeys(gone)), action="remove")
+
+
+@app.command
+def edit(
+    path: Path,
+    /,
+    *ids: str,
+    label: str | None = None,
+    start: Annotated[str | None, Parameter(name="--from")] = None,
+    end: Annotated[str | None, Parameter(name="--to")] = None,
+    tier: Tier = None,
+    note: str | None = None,
+    confidence: float | None = None,
+    channel: str | None = None,
+    source: str | None = None,
+    where: Where = WHERE,
+    common: Common = DEFAULT,
+) -> Outcome:
+    """Change annotations; they keep their ids.
+
+    Parameters
+    ----------
+    path : Path
+        The recording.
+    ids : str
+        Ids (marcha annotate list), or their beginnings.
+    label : str
+        New label.
+    start : str
+        New start, written like that of add.
+    end : str
+        New end.
+    tier : str
+        New tier.
+    note : str
+        New remark.
+    confidence : float
+        New confidence.
+    channel : str
+        Topic or segment that it speaks of.
+    source : str
+        Who says so.
+    """
+    from .. import recording
+    from ..recording import changes
+
+    rec = recording.open(path)
+    given = {
+        "label": label,
+        "start_ns": instant(start, rec, "--from"),
+        "end_ns": instant(end, rec, "--to"),
+        "tier": tier,
+        "note": note,
+        "confidence": confidence,
+        "channel": channel,
+        "source": source,
+    }
+    values = {k: v for k, v in given.items() if v is not None}
+    out = where.target(rec)
+    entry = changes.edit(rec, out, ids, values, **where.how)
+    return said(rec, out, entry)
 
 
 @app.command(name="import")
@@ -103,43 +208,100 @@ def import_(
     table: Path,
     /,
     *,
-    tier: str | None = None,
-    output: MaybeOutput = None,
-    in_place: InPlace = False,
-    force: Force = False,
+    tier: Tier = None,
+    format: Annotated[str | None, Parameter(name="--format")] = None,
+    offset: Annotated[float, Parameter(name="--offset")] = 0.0,
+    replace: Annotated[bool, Parameter(name="--replace", negative="")] = False,
+    source: str | None = None,
+    where: Where = WHERE,
     common: Common = DEFAULT,
 ) -> Outcome:
-    """Add the annotations of a table: BIDS events.tsv, or any CSV or TSV with the same columns.
+    """Add the labels of another tool: BIDS events, CSV or TSV, Audacity, ELAN, Praat, events of C3D.
 
     Parameters
     ----------
     path : Path
         The recording.
     table : Path
-        Columns onset, duration [s, from the recording's start] or start_ns, end_ns; trial_type or label;
-        optionally tier and metadata.
+        The file. A table has the columns onset, duration [s, from the recording's start] or start_ns, end_ns;
+        trial_type or label; optionally tier, id, source, confidence, note, channel, metadata.
     tier : str
-        Tier of rows that name none; the table's file name without it.
-    output : Path
-        New recording to write.
-    in_place : bool
-        Put the finished copy in the place of the recording.
-    force : bool
-        Replace an existing output.
+        Tier of labels that name none; the file's name without it.
+    format : str
+        table, audacity, eaf, textgrid or c3d; found by content without it.
+    offset : float
+        Seconds between the recording's start and the file's zero.
+    replace : bool
+        Annotations with the same ids are replaced.
+    source : str
+        Who says so, where the file does not.
     """
+    import polars as pl
+
     from .. import recording
-    from ..export.events import read_events
+    from ..export.labels import read_labels
 
     rec = recording.open(path)
-    return _write(
-        rec, read_events(table, rec.start_ns or 0, tier=tier), output, in_place=in_place, force=force
+    found = read_labels(table, rec, format=format, tier=tier, offset_ns=round(offset * 1e9))
+    for note in found.notes:
+        complain(f"{table}: {note}")
+    rows = found.annotations
+    if source is not None:
+        rows = rows.with_columns(pl.col("source").fill_null(source))
+    same = rec.annotations.filter(pl.col("id").is_in(rows["id"].drop_nulls().implode()))["id"].to_list()
+    return write(
+        rec,
+        where,
+        add=rows,
+        remove=tuple(same) if replace else (),
+        action=f"import {table.name}",
+        more={"format": found.format, "notes": found.notes},
     )
 
 
-@app.command(name="list")
-def list_(
-    path: Path, /, *, tier: Annotated[str | None, Parameter(name="--tier")] = None, common: Common = DEFAULT
+@app.command
+def export(
+    path: Path,
+    /,
+    *,
+    output: Output,
+    to: Annotated[str | None, Parameter(name=("--to", "-t"))] = None,
+    tier: Annotated[Strings, Parameter(name="--tier")] = (),
+    force: Force = False,
+    common: Common = DEFAULT,
 ) -> Outcome:
+    """Write annotations for another tool.
+
+    Parameters
+    ----------
+    path : Path
+        The recording.
+    output : Path
+        File to write.
+    to : str
+        events (BIDS), eaf, textgrid or audacity; by the file's ending without it.
+    tier : str
+        Tier or pattern; may be repeated. All without it.
+    force : bool
+        Replace an earlier file.
+    """
+    from .. import recording
+    from ..export.labels import WRITTEN
+    from ..recording.annotations import TOPIC
+    from ..recording.errors import UsageError
+    from .export import hand_on
+
+    endings = {m.suffix.lower(): name for name, m in WRITTEN.items()} | {".tsv": "events"}
+    name = to or endings.get(output.suffix.lower())
+    if name is None or name not in endings.values():
+        known = ", ".join(endings.values())
+        raise UsageError(f"{output}: {name or output.suffix!r} is no format of labels; give --to {known}")
+    options: dict[str, Any] = {"topics": tuple(TOPIC + t for t in tier)} if tier else {}
+    return hand_on(recording.open(path), name, output, options, force=force)
+
+
+@app.command(name="list")
+def list_(path: Path, /, *, tier: Tier = None, common: Common = DEFAULT) -> Outcome:
     """List annotations by time.
 
     Parameters
@@ -150,41 +312,32 @@ def list_(
         Only this tier.
     """
     from .. import recording
-    from ..export.events import to_events
+    from ..recording.events import to_events
 
     rec = recording.open(path)
-    events = to_events(rec.annotations, rec.start_ns or 0)
+    events = to_events(rec.annotations, rec.start_ns)
     say_losses(rec)
     if tier is not None:
         events = events.filter(tier=tier)
     rows = events.rows(named=True)
+    optional = [c for c in ("source", "confidence", "note", "channel") if events[c].null_count() < len(rows)]
     table = Table(
-        [">onset [s]", ">duration [s]", "tier", "label", "metadata"],
+        ["id", ">onset [s]", ">duration [s]", "tier", "label", *optional, "metadata"],
         [
-            [f"{r['onset']:.3f}", f"{r['duration']:.3f}", r["tier"], r["trial_type"], r["metadata"]]
+            [
+                r["id"],
+                f"{r['onset']:.3f}",
+                f"{r['duration']:.3f}",
+                r["tier"],
+                r["trial_type"],
+                *(r[c] for c in optional),
+                r["metadata"],
+            ]
             for r in rows
         ],
     )
     return Outcome({"path": str(path), "annotations": rows}, [table] if rows else [Heading("no annotations")])
 
 
-def _write(
-    rec: Recording, table: pl.DataFrame, output: Path | None, *, in_place: bool, force: bool
-) -> Outcome:
-    import polars as pl
-
-    from ..export.annotate import annotate
-    from ..recording.errors import UsageError
-
-    if in_place == (output is not None):
-        raise UsageError("annotate: give either -o NEW.mcap or --in-place")
-    target = rec.path if output is None else output
-    total = annotate(rec, table, target, overwrite=force or in_place)
-    say_losses(rec)
-    first, last = rec.start_ns or 0, rec.end_ns or 0
-    if outside := table.filter((pl.col("end_ns") < first) | (pl.col("start_ns") > last)).height:
-        complain(
-            f"warning: {outside} of {table.height} lie outside of the recording's {rec.duration_s:.1f} s"
-        )
-    document = {"output": str(target), "added": table.height, "annotations": total}
-    return Outcome(document, [Heading(f"wrote {target}: {table.height} added, {total} annotations")])
+for command in (log, undo, redo, rules, vocabulary, diff):
+    app.command(command)

@@ -51,7 +51,12 @@ COMMANDS: tuple[tuple[Group, str, str, str], ...] = (
     (WORK, "tune", "tune:tune", "Search the thresholds that fit walks of known length best."),
     (WORK, "study", "study:study", "Compare estimators over many recordings, with statistics."),
     (HAND, "view", "view:view", "Show recordings on one time line in the Rerun viewer."),
-    (HAND, "annotate", "annotate:app", "Add, import or list labelled intervals of a recording."),
+    (
+        HAND,
+        "annotate",
+        "annotate:app",
+        "Add, change, import, export, list or compare annotations of a recording.",
+    ),
     (HAND, "export", "export:export", "Write a recording, or part of it, in another tool's format."),
     (HAND, "demo", "demo:demo", "Simulate, convert, replay, evaluate and export three walks."),
     (

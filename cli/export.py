@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from .console import Heading, Outcome
+from .console import Heading, Outcome, complain
 from .contents import say_losses
 from .options import (
     DEFAULT,
@@ -18,6 +18,9 @@ from .options import (
     instant,
     settings,
 )
+
+if TYPE_CHECKING:
+    from ..recording import Recording
 
 
 def export(
@@ -40,7 +43,7 @@ def export(
     path : Path
         The recording.
     to : str
-        Format: mcap, csv, parquet, rrd … (marcha formats lists them).
+        Format: mcap, csv, parquet, bids, gpx, eaf, rrd … (marcha formats lists them).
     output : Path
         File or folder to write, as the format wants it.
     topic : str
@@ -54,7 +57,6 @@ def export(
     force : bool
         Replace an earlier export.
     """
-    from .. import export as ex
     from .. import recording
 
     rec = recording.open(path)
@@ -65,9 +67,23 @@ def export(
         "end_ns": instant(end, rec, "--end"),
     }
     options |= {key: value for key, value in chosen.items() if value not in (None, ())}
+    return hand_on(rec, to, output, options, force=force)
+
+
+def hand_on(rec: Recording, to: str, output: Path, options: dict[str, Any], *, force: bool) -> Outcome:
+    """Export, after saying what the format cannot hold."""
+    from .. import export as ex
+
+    missing = ex.losses(rec, to, options=options)
+    for line in missing:
+        complain(f"{to} does not hold: {line}")
     files = [str(file) for file in ex.export(rec, to, output, options=options, overwrite=force)]
     say_losses(rec)
-    return Outcome(
-        {"path": str(path), "format": to, "output": str(output), "files": files},
-        [Heading(f"wrote {file}") for file in files],
-    )
+    document = {
+        "path": str(rec.path),
+        "format": to,
+        "output": str(output),
+        "files": files,
+        "not_held": missing,
+    }
+    return Outcome(document, [Heading(f"wrote {file}") for file in files])

@@ -125,6 +125,18 @@ def instant(text: str | None, rec: Recording, option: str) -> int | None:
     return span if match["at"] else (rec.start_ns or 0) + span
 
 
+def span_ns(text: str, option: str) -> int:
+    """Return a length of time in nanoseconds: ``0.25``, ``250ms`` …; :func:`instant` states the errors."""
+    from decimal import Decimal
+
+    from ..recording.errors import UsageError
+
+    match = _TIME.fullmatch(text.strip())
+    if match is None or match["at"]:
+        raise UsageError(f"{option} {text}: is not a length of time; give 0.25s or 250ms")
+    return int((Decimal(match["value"]) * _UNIT_NS[(match["unit"] or "s").lower()]).to_integral_value())
+
+
 def plain(value: Any) -> Any:
     """Return a value as JSON knows it: NumPy scalars, paths and structs become numbers, text and dicts."""
     if isinstance(value, Path):

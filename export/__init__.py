@@ -1,8 +1,8 @@
-"""From a recording to other tools: annotated MCAP, CSV and Parquet folders, and what plug-ins add."""
+"""From a recording to other tools: annotated MCAP, tables, BIDS, tracks, labels, and what plug-ins add."""
 
 from __future__ import annotations
 
 from .contract import Exporter
-from .registry import available, export
+from .registry import available, export, losses
 
-__all__ = ["Exporter", "available", "export"]
+__all__ = ["Exporter", "available", "export", "losses"]

@@ -32,6 +32,16 @@ class Exporter(Protocol):
     suffix: ClassVar[str]
     Options: ClassVar[type[msgspec.Struct]]
 
+    def losses(self, rec: Recording, options: Any) -> list[str]:
+        """Return what of this recording the format cannot hold, a line each; it is said before writing.
+
+        Parameters
+        ----------
+        rec, options
+            See :meth:`export`.
+        """
+        ...
+
     def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:
         """Write ``rec`` to ``path``: the whole of it, or nothing.
 

@@ -1,63 +1,24 @@
-"""Annotations as a BIDS events table (``events.tsv``), and back."""
+"""Annotations from tables: BIDS ``events.tsv`` and any other of text with the same columns."""
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
+import msgspec
 import polars as pl
 
+from ..recording.annotations import COLUMNS as ANNOTATIONS
+from ..recording.annotations import FIELDS
 from ..recording.errors import MarchaError
+from ..recording.events import COLUMNS, events_text, sidecar, to_events
 
-ANNOTATIONS = {
-    "tier": pl.String,
-    "start_ns": pl.Int64,
-    "end_ns": pl.Int64,
-    "label": pl.String,
-    "metadata": pl.String,
-}
-"""Columns of an annotation table; ``metadata`` is JSON text."""
-
-COLUMNS = {
-    "onset": "s since the start of the recording",
-    "duration": "s",
-    "trial_type": "label of the annotation",
-    "tier": "kind of annotation: who or what says so",
-    "start_ns": "ns, clock of the recording",
-    "end_ns": "ns, clock of the recording",
-    "metadata": "JSON object of further facts",
-}
-"""Columns of ``events.tsv`` with their units."""
+__all__ = ["ANNOTATIONS", "COLUMNS", "events_text", "read_events", "sidecar", "to_events"]
 
 _MOST_NS = 2**62
 
 
-def to_events(annotations: pl.DataFrame, origin_ns: int) -> pl.DataFrame:
-    """Return annotations as BIDS events.
-
-    Parameters
-    ----------
-    annotations : polars.DataFrame
-        Columns of :data:`ANNOTATIONS`.
-    origin_ns : int
-        Time that onsets count from: the start of the recording.
-
-    Returns
-    -------
-    polars.DataFrame
-        Columns of :data:`COLUMNS`, by onset. Nanoseconds stay beside the seconds: nothing is rounded away.
-    """
-    return annotations.select(
-        onset=((pl.col("start_ns") - origin_ns) / 1e9).round(9),
-        duration=((pl.col("end_ns") - pl.col("start_ns")) / 1e9).round(9),
-        trial_type=pl.col("label"),
-        tier="tier",
-        start_ns="start_ns",
-        end_ns="end_ns",
-        metadata="metadata",
-    ).sort("start_ns", maintain_order=True)
-
-
-def read_events(path: Path, origin_ns: int, *, tier: str | None = None) -> pl.DataFrame:
+def read_events(path: Path, origin_ns: int, *, tier: str | None = None, offset_ns: int = 0) -> pl.DataFrame:
     """Read annotations from a table.
 
     Parameters
@@ -65,10 +26,13 @@ def read_events(path: Path, origin_ns: int, *, tier: str | None = None) -> pl.Da
     path : Path
         Tab- or comma-separated text with a header. Times are ``onset`` and ``duration`` in seconds since the
         start of the recording, or ``start_ns`` and ``end_ns``, which win where both are there. The label is
-        ``trial_type`` or ``label``; ``tier`` and ``metadata`` (JSON text) are optional. ``n/a`` is an empty
-        cell.
+        ``trial_type`` or ``label``; ``tier``, ``metadata`` (JSON text), ``id``, ``source``, ``confidence``,
+        ``note`` and ``channel`` are optional; other columns become metadata. ``n/a`` is an empty cell, and a
+        duration that is not known is that of an instant.
     origin_ns : int
         Time that onsets count from.
+    offset_ns : int
+        Added to ``start_ns`` and ``end_ns``.
     tier : str, optional
         Tier of rows that name none; the file's name without suffix by default.
 
@@ -85,9 +49,10 @@ def read_events(path: Path, origin_ns: int, *, tier: str | None = None) -> pl.Da
     cells = _cells(path)
     names = set(cells.columns)
     if {"start_ns", "end_ns"} <= names:
-        start, end = (_numbers(path, cells, name, pl.Int64) for name in ("start_ns", "end_ns"))
+        start, end = (_numbers(path, cells, name, pl.Int64) + offset_ns for name in ("start_ns", "end_ns"))
     elif {"onset", "duration"} <= names:
-        onset, duration = (_numbers(path, cells, name, pl.Float64) for name in ("onset", "duration"))
+        known = cells.with_columns(pl.col("duration").fill_null("0"))
+        onset, duration = (_numbers(path, known, name, pl.Float64) for name in ("onset", "duration"))
         start = origin_ns + _nanoseconds(path, onset)
         end = start + _nanoseconds(path, duration)
     else:
@@ -106,26 +71,83 @@ def read_events(path: Path, origin_ns: int, *, tier: str | None = None) -> pl.Da
             else pl.Series([default] * cells.height),
             "start_ns": start,
             "end_ns": end,
-            "label": cells[label].fill_null(""),
-            "metadata": cells["metadata"].fill_null("{}")
-            if "metadata" in names
-            else pl.Series(["{}"] * cells.height),
+            # this table as marcha writes it has a label in every row, so that n/a is one of them
+            "label": cells[label].fill_null("n/a" if {"id", "start_ns"} <= names else ""),
+            "metadata": _metadata(path, cells, label),
+            **{
+                name: cells[name] if name in names else pl.Series([None] * cells.height, dtype=pl.String)
+                for name in FIELDS
+                if name != "confidence"
+            },
+            "confidence": _confidence(path, cells),
         },
-        schema=ANNOTATIONS,
-    )
+        schema_overrides=ANNOTATIONS,
+    ).select(*ANNOTATIONS)
     _check(path, table)
     return table
 
 
+def _metadata(path: Path, cells: pl.DataFrame, label: str) -> pl.Series:
+    """Return the metadata of each row: the column of that name, and columns that have no other place."""
+    places = {"onset", "duration", "tier", "start_ns", "end_ns", "metadata", label, *FIELDS}
+    others = [name for name in cells.columns if name not in places]
+    given = (
+        cells["metadata"].fill_null("{}").to_list() if "metadata" in cells.columns else ["{}"] * cells.height
+    )
+    if not others:
+        return pl.Series(given, dtype=pl.String)
+    out = []
+    for row, (text, values) in enumerate(zip(given, cells.select(others).iter_rows(), strict=True)):
+        try:
+            facts = msgspec.json.decode(text, type=dict)
+        except msgspec.MsgspecError:
+            raise MarchaError(
+                f"{path}: line {row + 2}: metadata {text[:60]!r} is not a JSON object; correct the cell"
+            ) from None
+        facts |= {k: v for k, v in zip(others, values, strict=True) if v is not None}
+        out.append(msgspec.json.encode(facts).decode())
+    return pl.Series(out, dtype=pl.String)
+
+
+def _confidence(path: Path, cells: pl.DataFrame) -> pl.Series:
+    if "confidence" not in cells.columns:
+        return pl.Series([None] * cells.height, dtype=pl.Float64)
+    texts = cells["confidence"]
+    values = texts.str.strip_chars().cast(pl.Float64, strict=False)
+    bad = (texts.is_not_null() & ~values.is_between(0.0, 1.0).fill_null(False)).arg_true()
+    if bad.len():
+        row = int(bad[0])
+        raise MarchaError(
+            f"{path}: line {row + 2}: confidence is {texts[row]!r}, not a number between 0 and 1; correct it"
+        )
+    return values
+
+
 def _cells(path: Path) -> pl.DataFrame:
-    head = path.read_bytes()[:65536]
-    if not head.strip():
-        raise MarchaError(f"{path}: is empty; needs a header line and one row an annotation")
-    separator = "\t" if b"\t" in head.splitlines()[0] else ","
     try:
-        return pl.read_csv(
-            path, separator=separator, infer_schema=False, null_values=["n/a", ""], encoding="utf8"
+        data = path.read_bytes()
+    except OSError as error:
+        raise MarchaError(f"{path}: cannot read: {error.strerror or error}") from None
+    if not data.strip():
+        raise MarchaError(f"{path}: is empty; needs a header line and one row an annotation")
+    try:
+        data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise MarchaError(
+            f"{path}: line {line}: byte 0x{data[error.start]:02x} is not UTF-8; save the table as UTF-8"
+        ) from None
+    separator = "\t" if b"\t" in data[:65536].splitlines()[0] else ","
+    try:
+        cells = pl.read_csv(
+            io.BytesIO(data),
+            separator=separator,
+            infer_schema=False,
+            null_values=["n/a"],
+            encoding="utf8",
         ).rename(lambda name: name.strip().strip("\ufeff"))
+        empty = [name for name in cells.columns if name not in ("trial_type", "label")]
+        return cells.with_columns(pl.when(pl.col(name) != "").then(name) for name in empty)
     except pl.exceptions.PolarsError as error:
         reason = " ".join(str(error).split())[:200]
         raise MarchaError(f"{path}: is not a table of text: {reason}") from None

@@ -19,7 +19,8 @@ MARKER = "channels.json"
 def whole_folder(path: Path, *, overwrite: bool = False, marker: str = MARKER) -> Iterator[Path]:
     """Give a temporary folder beside ``path`` that takes its name when the block ends well.
 
-    The temporary folder is called ``.<name>.<process>.part``. An exception removes it; after a kill it stays,
+    The temporary folder is called ``.<name>.<process>.part`` (a second one
+    at once has a number of its own). An exception removes it; after a kill it stays,
     is never mistaken for an export, and the next export to the same name removes it.
 
     Parameters
@@ -41,13 +42,12 @@ def whole_folder(path: Path, *, overwrite: bool = False, marker: str = MARKER) -
     path = Path(os.path.abspath(path))
     _remove_leftovers(path)
     _may_be_created(path, overwrite, marker)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part = _new_part(path)
     try:
-        part.mkdir()
         yield part
         for file in sorted(p for p in part.rglob("*") if p.is_file()):
             _flush(file)
-        _put(part, path)
+        _put(part, path, overwrite)
     except BaseException as error:
         shutil.rmtree(part, ignore_errors=True)
         if isinstance(error, OSError) and error.filename is None:  # a failed write does not know its file
@@ -56,6 +56,19 @@ def whole_folder(path: Path, *, overwrite: bool = False, marker: str = MARKER) -
         raise
     if os.name == "posix":
         _flush(path.parent)
+
+
+def _new_part(path: Path) -> Path:
+    """Create the temporary folder; a second export of the same process has a number of its own."""
+    number = 0
+    while True:
+        part = path.with_name(f".{path.name}.{os.getpid()}{f'-{number}' if number else ''}.part")
+        try:
+            part.mkdir()
+        except FileExistsError:
+            number += 1
+        else:
+            return part
 
 
 def _may_be_created(path: Path, overwrite: bool, marker: str) -> None:
@@ -74,12 +87,24 @@ def _may_be_created(path: Path, overwrite: bool, marker: str) -> None:
             )
 
 
-def _put(part: Path, path: Path) -> None:
-    """Rename ``part`` to ``path``; an earlier export steps aside first and comes back if that fails."""
+def _put(part: Path, path: Path, overwrite: bool) -> None:
+    """Rename ``part`` to ``path``; an earlier export steps aside first and comes back if that fails.
+
+    Without ``overwrite`` the system's own rename decides between two exports at once: it replaces a folder
+    only where that is empty.
+    """
+    if not overwrite:
+        try:
+            part.rename(path)
+        except OSError as error:
+            if path.exists():
+                raise OutputExists(path) from None
+            raise error
+        return
     if not path.exists():
         part.rename(path)
         return
-    old = path.with_name(f".{path.name}.{os.getpid()}.old")
+    old = part.with_suffix(".old")
     path.rename(old)
     try:
         part.rename(path)
@@ -93,7 +118,7 @@ def _remove_leftovers(path: Path) -> None:
     """Remove what killed processes left: parts, and an old export that was already replaced."""
     for kind in ("part", "old"):
         for left in path.parent.glob(f".{escape(path.name)}.*.{kind}"):
-            number = left.name.removesuffix(f".{kind}").rpartition(".")[2]
+            number = left.name.removesuffix(f".{kind}").rpartition(".")[2].partition("-")[0]
             if not number.isdigit() or _alive(int(number)):
                 continue
             if kind == "old" and not path.exists():

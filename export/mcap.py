@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 import msgspec
-import numpy as np
 import polars as pl
 
 from ..recording import (
@@ -18,12 +17,11 @@ from ..recording import (
     create,
 )
 from ..recording.errors import MarchaError
+from ..recording.events import SIDECAR, TABLE
 from ..recording.selection import Selection, selected_topics, within
-from .events import ANNOTATIONS
+from .rules import by_rules
 
 EVENT = "foxglove_msgs/msg/Event"
-STANCE = "marcha_msgs/msg/Stance"
-STEP = "marcha_msgs/msg/Step"
 ESTIMATE = "/estimate/"
 
 
@@ -49,6 +47,10 @@ class McapExporter:
     suffix: ClassVar[str] = ".mcap"
     Options: ClassVar[type[msgspec.Struct]] = McapOptions
 
+    def losses(self, rec: Recording, options: Any) -> list[str]:
+        """Return nothing but what the options leave out: this is the recording itself."""
+        return []
+
     def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:
         """Write one file; see :class:`marcha.export.Exporter`."""
         topics = selected_topics(rec, options)
@@ -61,11 +63,11 @@ class McapExporter:
             else:
                 _copy_part(rec, kept, options, out)
             if options.annotations:
-                phases = pl.concat(
-                    [pl.DataFrame(schema=ANNOTATIONS), *(phases_of(rec, t, options) for t in data)]
-                )
+                phases = by_rules(rec, ("stance", "step"), options)
+                phases = phases.filter(~pl.col("tier").is_in(rec.annotations["tier"].unique().implode()))
                 if phases.height:
-                    out.add_annotations(phases.sort("start_ns", maintain_order=True))
+                    out.add_annotations(phases)
+                out.attach_events()
             out.add_metadata(_free("export", rec.metadata), provenance(rec, options))
         return [path]
 
@@ -86,8 +88,10 @@ def _copy_part(rec: Recording, topics: list[str], options: McapOptions, out: Wri
     for name, values in rec.metadata.items():
         out.add_metadata(name, values)
     for attachment in rec.attachments:
+        if attachment.name in (TABLE, SIDECAR):
+            continue  # written anew
         out.add_attachment(attachment.name, rec.attachment(attachment.name), attachment.media_type)
-    known = within(rec.annotations, options)
+    known = within(rec.stored_annotations, options)
     if options.annotations and known.height:
         out.add_annotations(known)
 
@@ -109,38 +113,3 @@ def provenance(rec: Recording, options: McapOptions) -> dict[str, str]:
         "source_size": str(rec.path.stat().st_size),
         "options": msgspec.json.encode(chosen).decode(),
     }
-
-
-def phases_of(rec: Recording, topic: str, selection: Selection) -> pl.DataFrame:
-    """Return stances or steps of an estimate as annotations, empty where the recording has them already.
-
-    Tiers are ``<run>/stance`` and ``<run>/step``, as a replay names them. A stance lasts from its first still
-    sample to the first moving one, or to the last sample.
-    """
-    channel = rec.channels[topic]
-    run, _, _ = topic.removeprefix(ESTIMATE).rpartition("/")
-    tier = {STANCE: f"{run}/stance", STEP: f"{run}/step"}.get(channel.schema)
-    if not topic.startswith(ESTIMATE) or tier is None or tier in rec.annotations["tier"]:
-        return pl.DataFrame(schema=ANNOTATIONS)
-    table = rec.table(topic, start_ns=selection.start_ns, end_ns=selection.end_ns)
-    if channel.schema == STEP:
-        return table.select(
-            tier=pl.lit(tier),
-            start_ns="start_ns",
-            end_ns="end_ns",
-            label=pl.format("step {}", "index"),
-            metadata=pl.struct("index", "length_m", "height_m", "heading_rad").struct.json_encode(),
-        )
-    return _stances(table, tier)
-
-
-def _stances(table: pl.DataFrame, tier: str) -> pl.DataFrame:
-    if not table.height:
-        return pl.DataFrame(schema=ANNOTATIONS)
-    t_ns = table["t_ns"].to_numpy()
-    still = table["still"].to_numpy().astype(np.int8)
-    edges = np.diff(still, prepend=np.int8(0), append=np.int8(0))
-    first, after = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-    return pl.DataFrame({"start_ns": t_ns[first], "end_ns": t_ns[np.minimum(after, len(t_ns) - 1)]}).select(
-        tier=pl.lit(tier), start_ns="start_ns", end_ns="end_ns", label=pl.lit("stance"), metadata=pl.lit("{}")
-    )

@@ -74,6 +74,27 @@ def export(
     return chosen().export(rec, Path(path), _typed(chosen, options or {}), overwrite=overwrite)
 
 
+def losses(rec: Recording, to: str, *, options: Mapping[str, Any] | None = None) -> list[str]:
+    """Return what of a recording a format cannot hold, a line each; nothing is written.
+
+    Parameters
+    ----------
+    rec, to, options
+        See :func:`export`.
+
+    Raises
+    ------
+    UsageError
+        Unknown exporter or option.
+    """
+    exporters = available()
+    if to not in exporters:
+        raise UsageError(f"export format {to!r}: not known; there are {', '.join(exporters)}")
+    chosen = exporters[to]
+    say = getattr(chosen, "losses", None)  # plug-ins of the first version do not have it
+    return say(chosen(), rec, _typed(chosen, options or {})) if say is not None else []
+
+
 def _typed(exporter: type[Exporter], options: Mapping[str, Any]) -> msgspec.Struct:
     """Return the exporter's options; text becomes the option's type, a list is separated by commas."""
     about = msgspec.inspect.type_info(exporter.Options)

@@ -110,6 +110,11 @@ class McapFile:
             self.abort()
             raise
 
+    @property
+    def start_ns(self) -> int | None:
+        """Log time of the first message in the file so far; None where there is none."""
+        return self._statistics.message_start_time if self._statistics.message_count else None
+
     def add_schema(self, name: str, encoding: str, data: bytes, id_: int | None = None) -> int:
         """Write a schema record unless it is there; return its id (``id_`` where that is free)."""
         key = (name, encoding, data)

@@ -24,6 +24,7 @@ from .annotations import (
     EVENT,
     TOPIC,
     EventDecoder,
+    identified,
 )
 from .cdr import CdrError
 from .chunks import (
@@ -233,13 +234,31 @@ class Recording:
 
     @cached_property
     def annotations(self) -> pl.DataFrame:
-        """Annotations by start time: ``tier, start_ns, end_ns, label, metadata`` (JSON text)."""
+        """Annotations by start time: the columns of :data:`marcha.recording.annotations.COLUMNS`."""
+        return identified(self.stored_annotations)
+
+    @cached_property
+    def stored_annotations(self) -> pl.DataFrame:
+        """The same as the file has them: those without an id stay without one."""
         parts = [
             self.table(s.topic).select(pl.lit(s.topic.removeprefix(TOPIC)).alias("tier"), *list(COLUMNS)[1:])
             for s in self.sources.values()
             if isinstance(s.decoder, EventDecoder)
         ]
-        return pl.concat([pl.DataFrame(schema=COLUMNS), *parts]).sort("start_ns", maintain_order=True)
+        table = pl.concat([pl.DataFrame(schema=COLUMNS), *parts]).sort("start_ns", maintain_order=True)
+        return table.with_columns(id=pl.when(pl.col("id").is_first_distinct()).then("id"))
+
+    @property
+    def data_span(self) -> tuple[int, int] | None:
+        """Log time of the first and last message that is no annotation; None where there is none."""
+        spans = [
+            (c.start_ns, c.end_ns)
+            for t, c in self.channels.items()
+            if not isinstance(self.sources[t].decoder, EventDecoder)
+            and c.start_ns is not None
+            and c.end_ns is not None
+        ]
+        return (min(a for a, _ in spans), max(b for _, b in spans)) if spans else None
 
     # ------------------------------------------------------------------------------------------------ reading
 

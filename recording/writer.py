@@ -12,6 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+import msgspec
 import numpy as np
 import polars as pl
 from mcap.records import Channel
@@ -21,7 +22,9 @@ from .annotations import (
     EVENT,
     TOPIC,
     check_annotations,
+    check_ids,
     encode_events,
+    identified,
 )
 from .codec import (
     Chunk,
@@ -31,6 +34,7 @@ from .codec import (
 )
 from .definitions import full_text
 from .errors import MarchaError, UsageError
+from .events import SIDECAR, TABLE, events_text, sidecar, to_events
 from .mcapfile import (
     CHUNK_SIZE,
     ZSTD_LEVEL,
@@ -98,6 +102,8 @@ class Writer:
         self._jobs: deque[Future[None]] = deque()
         self._outputs: dict[str, _Output] = {}
         self._annotations: list[pl.DataFrame] = []
+        self._metadata: dict[str, dict[str, str]] = {}
+        self._events = False
         self._closed = False
 
     def __enter__(self) -> Self:
@@ -230,7 +236,8 @@ class Writer:
         Parameters
         ----------
         table : polars.DataFrame
-            ``tier, start_ns, end_ns, label`` and optionally ``metadata`` (JSON text or a struct).
+            ``tier, start_ns, end_ns, label`` and optionally ``metadata`` (JSON text or a struct) and
+            :data:`marcha.recording.annotations.FIELDS`.
 
         Raises
         ------
@@ -239,9 +246,15 @@ class Writer:
         """
         self._check_open()
         try:
-            self._annotations.append(check_annotations(table))
+            checked = check_annotations(table)
+            if checked.height:
+                self._annotations.append(checked)
         except MarchaError as e:
             raise type(e)(f"{self.path}: {e}") from None
+
+    def attach_events(self) -> None:
+        """Attach the annotations as BIDS ``events.tsv`` and ``events.json`` when the recording is closed."""
+        self._events = True
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Write a metadata record; values become strings.
@@ -253,6 +266,7 @@ class Writer:
         """
         self._check_open()
         self._caught_up().add_metadata(name, values)
+        self._metadata[name] = dict(values)
 
     def add_attachment(self, name: str, data: bytes, media_type: str = "application/octet-stream") -> None:
         """Attach a file (anchor table, floor plan, raw source …).
@@ -265,12 +279,19 @@ class Writer:
         self._check_open()
         self._caught_up().add_attachment(name, data, media_type)
 
-    def copy_from(self, rec: Recording, topics: Collection[str] | None = None) -> None:
+    def copy_from(
+        self,
+        rec: Recording,
+        topics: Collection[str] | None = None,
+        *,
+        annotations: bool = True,
+        leave: Collection[str] = (),
+    ) -> None:
         """Copy channels of another recording, with its metadata records, attachments and annotations.
 
         Chunks are copied as they are, without decompressing, unless they also hold channels that are left out
         or channel ids are taken; those that are not compressed are compressed, unless this writer does not.
-        Copied channels cannot be appended to.
+        Copied channels cannot be appended to. A table of events that is attached is written anew.
 
         Parameters
         ----------
@@ -278,6 +299,10 @@ class Writer:
             The source.
         topics : collection of str, optional
             Channels to copy (an annotation tier is one), default all.
+        annotations : bool
+            Whether annotations are copied.
+        leave : collection of str
+            Names of metadata records and attachments that are not copied.
 
         Raises
         ------
@@ -290,15 +315,19 @@ class Writer:
 
         self._check_open()
         copy_into(self._caught_up(), rec, topics, self._level)
-        annotations = rec.annotations
-        if topics is not None:
-            annotations = annotations.filter((TOPIC + pl.col("tier")).is_in(list(topics)))
-        if annotations.height:
-            self.add_annotations(annotations)
+        if annotations:
+            table = rec.stored_annotations
+            if topics is not None:
+                table = table.filter((TOPIC + pl.col("tier")).is_in(list(topics)))
+            if table.height:
+                self.add_annotations(table)
+        self._events |= any(a.name == TABLE for a in rec.attachments)
         for name, values in rec.metadata.items():
-            self.add_metadata(name, values)
+            if name not in leave:
+                self.add_metadata(name, values)
         for attachment in rec.attachments:
-            self.add_attachment(attachment.name, rec.attachment(attachment.name), attachment.media_type)
+            if attachment.name not in leave and attachment.name not in (TABLE, SIDECAR):
+                self.add_attachment(attachment.name, rec.attachment(attachment.name), attachment.media_type)
 
     def close(self) -> None:
         """Write what is pending and the summary, and put the file in its place."""
@@ -403,6 +432,16 @@ class Writer:
         out.chunk, out.records = None, []
 
     def _put_annotations(self, table: pl.DataFrame) -> None:
+        check_ids(table)
+        if self._events:
+            self._file.drain()
+            table = identified(table.sort("start_ns", maintain_order=True))
+            first = int(table["start_ns"].min() or 0)  # pyright: ignore[reportArgumentType]
+            origin = min(first, self._file.start_ns) if self._file.start_ns is not None else first
+            events = events_text(to_events(table, origin)).encode()
+            about = msgspec.json.format(msgspec.json.encode(sidecar(self._metadata)), indent=2) + b"\n"
+            self._file.add_attachment(TABLE, events, "text/tab-separated-values")
+            self._file.add_attachment(SIDECAR, about, "application/json")
         for (tier,), rows in table.group_by("tier", maintain_order=True):
             topic = f"{TOPIC}{tier}"
             if any(c.topic == topic for c in self._file.channels.values()):

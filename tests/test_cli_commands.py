@@ -406,6 +406,13 @@ def test_annotate_in_place_keeps_everything(folder: Path, tmp_path: Path) -> Non
     assert rec.annotations["label"].to_list() == ["a", "b"]
     assert rec.table("/foot/imu1").equals(before.table("/foot/imu1"))
     assert rec.metadata == before.metadata
+    assert marcha("annotate", "undo", copy, "--in-place").code == 0
+    assert mr.open(copy).annotations["label"].to_list() == ["a"]
+    assert [c["action"] for c in marcha("annotate", "log", copy, "--json").document["changes"]] == [
+        "add",
+        "add",
+        "undo",
+    ]
 
 
 def test_annotate_import_of_what_export_wrote(folder: Path, tmp_path: Path) -> None:
@@ -442,8 +449,9 @@ def test_annotate_import_of_plain_bids(folder: Path, tmp_path: Path) -> None:
 def test_an_annotation_outside_of_the_recording_is_said(folder: Path, tmp_path: Path) -> None:
     late = ("--label", "x", "--from", "1000", "-o", tmp_path / "late.mcap")
     done = marcha("annotate", "add", folder / "walk.mcap", *late)
-    assert done.code == 0
-    assert "outside" in done.err
+    assert done.code == 1
+    assert "outside" in done.complaint
+    assert not (tmp_path / "late.mcap").exists()
 
 
 def test_annotate_needs_one_place_to_write_to(folder: Path, tmp_path: Path) -> None:

@@ -52,10 +52,8 @@ def test_stances_become_annotations(rec: Recording) -> None:
     found = exported(rec).annotations.filter(tier="mine/stance")
     inside = pl.lit(False)
     for row in found.iter_rows(named=True):
-        inside = inside | pl.col("t_ns").is_between(row["start_ns"], row["end_ns"], closed="left")
-    last = stance["t_ns"][-1]
-    again = stance.with_columns(still=inside).filter(pl.col("t_ns") < last)
-    assert_frame_equal(again, stance.filter(pl.col("t_ns") < last))
+        inside = inside | pl.col("t_ns").is_between(row["start_ns"], row["end_ns"], closed="both")
+    assert_frame_equal(stance.with_columns(still=inside), stance)
 
 
 def test_stances_that_are_annotated_already_are_not_doubled(rec: Recording) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -10,7 +11,7 @@ import msgspec
 import numpy as np
 import polars as pl
 import pytest
-from marcha.export import available, export
+from marcha.export import available, export, losses
 from marcha.recording import OutputExists, Recording, UsageError
 
 START_NS = 1_700_000_000_000_000_000
@@ -85,8 +86,10 @@ class ExporterContract:
 
     def test_leaves_nothing_else_behind(self, rec: Recording, tmp_path: Path) -> None:
         before = set(tmp_path.iterdir())
-        self.run(rec, self.target(tmp_path))
-        assert set(tmp_path.iterdir()) - before == {self.target(tmp_path)}
+        files = self.run(rec, self.target(tmp_path))
+        left = set(tmp_path.iterdir()) - before
+        assert self.target(tmp_path) in left
+        assert left - {self.target(tmp_path)} <= set(files)
 
     def test_leaves_the_recording_as_it_was(self, rec: Recording, tmp_path: Path) -> None:
         before = rec.path.read_bytes()
@@ -103,6 +106,29 @@ class ExporterContract:
     def test_overwrites_when_told(self, rec: Recording, tmp_path: Path) -> None:
         self.run(rec, self.target(tmp_path))
         assert all(f.is_file() for f in self.run(rec, self.target(tmp_path), overwrite=True))
+
+    def test_says_what_the_format_does_not_hold(self, rec: Recording, tmp_path: Path) -> None:
+        before = set(tmp_path.iterdir())
+        said = losses(rec, self.name)
+        assert all(line and "\n" not in line for line in said)
+        assert set(tmp_path.iterdir()) == before
+
+    def test_one_of_two_at_once_is_refused(
+        self, rec: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        target = self.target(tmp_path)
+        first: list[Path] = []
+        real = Path.rename if not available()[self.name].suffix else os.link
+
+        def beaten(part: Any, path: Any, *rest: Any, **more: Any) -> Any:
+            if not first and Path(path) == target:
+                first.append(target)  # the other one is done while this one puts its result in place
+                self.run(rec, target)
+            return real(part, path, *rest, **more)
+
+        monkeypatch.setattr(*((Path, "rename") if real is not os.link else (os, "link")), beaten)
+        with pytest.raises(OutputExists):
+            self.run(rec, target)
 
     def test_unknown_option_is_refused(self, rec: Recording, tmp_path: Path) -> None:
         with pytest.raises(UsageError, match="no_such_option"):
@@ -123,6 +149,7 @@ class ExporterContract:
             raise RuntimeError("the disk broke")
 
         monkeypatch.setattr(type(rec), "windows", broken)
+        monkeypatch.setattr(type(rec), "table", broken)
         monkeypatch.setattr(mr.Writer, "copy_from", broken)
         with pytest.raises(RuntimeError, match="the disk broke"):
             self.run(rec, self.target(tmp_path))
