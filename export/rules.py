@@ -279,7 +279,7 @@ def _saturated(values: NDArray[np.float64], limit: float) -> bool:
 
     A sensor at rest also repeats its largest value, and so does one that lies still most of the time.
     """
-    if abs(limit) <= 2.0 * float(np.nanmedian(np.abs(values))):
+    if abs(limit) <= 1.2 * float(np.nanmedian(np.abs(values))):
         return False
     first, last = _stretches(values == limit)
     before, after = values[np.maximum(first - 1, 0)], values[np.minimum(last + 1, len(values) - 1)]
