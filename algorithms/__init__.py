@@ -21,10 +21,11 @@ from .contract import (
     output_columns,
 )
 from .parameters import Parameter, describe
-from .registry import available, find, make
+from .registry import CALIBRATIONS, available, build_params, find, make
 
 __all__ = [
     "ALL_COLUMNS",
+    "CALIBRATIONS",
     "AlgorithmError",
     "Annotate",
     "Calibration",
@@ -44,6 +45,7 @@ __all__ = [
     "RowKernel",
     "Stretch",
     "available",
+    "build_params",
     "describe",
     "find",
     "input_columns",

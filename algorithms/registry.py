@@ -16,40 +16,38 @@ from .contract import AlgorithmError, PlainEstimator
 from .parameters import describe
 
 GROUP = "marcha.estimators"
+CALIBRATIONS = "marcha.calibrations"
 
 
-def available() -> dict[str, type[PlainEstimator]]:
-    """Return every installed estimator by name, sorted.
+def available(group: str = GROUP) -> dict[str, Any]:
+    """Return every installed estimator by name, sorted (with ``group=CALIBRATIONS``: every calibration).
 
-    Built-in ones and plug-ins register alike, as entry points of the group ``marcha.estimators``. A plug-in
-    that cannot be loaded, or that is no estimator, is left out with a warning that names it.
+    Built-in ones and plug-ins register alike, as entry points of the group. A plug-in that cannot be loaded, or
+    that is of another kind, is left out with a warning that names it.
     """
-    found: dict[str, type[PlainEstimator]] = {}
-    for point in _points(entry_points, tuple(sys.path)):
-        cls = _load(point)
-        if cls is not None:
-            found[point.name] = cls
-    return found
+    loaded = {p.name: _load(p, group) for p in _points(entry_points, tuple(sys.path), group)}
+    return {name: cls for name, cls in loaded.items() if cls is not None}
 
 
-def find(name: str) -> type[PlainEstimator]:
-    """Return the estimator class called ``name``.
+def find(name: str, group: str = GROUP) -> Any:
+    """Return the estimator class (or calibration) called ``name``.
 
     Raises
     ------
     AlgorithmError
         Where there is none; lists what there is.
     """
-    points = [p for p in _points(entry_points, tuple(sys.path)) if p.name == name]
+    points = [p for p in _points(entry_points, tuple(sys.path), group) if p.name == name]
     for point in points:
-        cls = _load(point)
+        cls = _load(point, group)
         if cls is not None:
             return cls
+    kind = _METHODS[group][0]
     if points:
         raise AlgorithmError(
-            f"estimator {name!r} cannot be loaded (see the warning); available: {_names(available())}"
+            f"{kind} {name!r} cannot be loaded (see the warning); available: {_names(available(group))}"
         )
-    raise AlgorithmError(f"no estimator {name!r}; available: {_names(available())}")
+    raise AlgorithmError(f"no {kind} {name!r}; available: {_names(available(group))}")
 
 
 def make(name: str, /, *, preset: str | None = None, **params: Any) -> PlainEstimator:
@@ -103,25 +101,26 @@ def _preset(name: str, cls: type[PlainEstimator], preset: str | None) -> dict[st
     return cls.presets[preset]
 
 
+_METHODS = {GROUP: ("estimator", ("take", "step")), CALIBRATIONS: ("calibration", ("calibrate",))}
+
+
 @lru_cache(maxsize=8)
-def _points(scan: Callable[..., Any], path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+def _points(scan: Callable[..., Any], path: tuple[str, ...], group: str = GROUP) -> tuple[EntryPoint, ...]:
     """Return the entry points by name. A scan of all that is installed takes 10 ms: one for each
     ``sys.path``.
     """
-    return tuple(sorted(scan(group=GROUP), key=lambda p: p.name))
+    return tuple(sorted(scan(group=group), key=lambda p: p.name))
 
 
-def _load(point: Any) -> type[PlainEstimator] | None:
+def _load(point: Any, group: str = GROUP) -> Any:
+    kind, methods = _METHODS[group]
     try:
         cls = point.load()
-        if not (
-            isinstance(cls, type)
-            and (callable(getattr(cls, "take", None)) or callable(getattr(cls, "step", None)))
-        ):
-            raise TypeError(f"{cls!r} is not a class with a method take or step")
+        if not (isinstance(cls, type) and any(callable(getattr(cls, m, None)) for m in methods)):
+            raise TypeError(f"{cls!r} is not a class with a method {' or '.join(methods)}")
     except Exception as error:
         warnings.warn(
-            f"estimator plug-in {point.name!r} ({point.value}) cannot be loaded: {error}", stacklevel=3
+            f"{kind} plug-in {point.name!r} ({point.value}) cannot be loaded: {error}", stacklevel=3
         )
         return None
     return cls

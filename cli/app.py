@@ -48,6 +48,7 @@ COMMANDS: tuple[tuple[Group, str, str, str], ...] = (
     (WORK, "estimators", "available:estimators", "List the estimators, and the parameters of those named."),
     (WORK, "replay", "replay:replay", "Feed a recording to estimators as if it were live."),
     (WORK, "evaluate", "replay:evaluate", "Measure the estimates of a replayed recording."),
+    (WORK, "calibrate", "calibrate:calibrate", "Let a calibration look at recordings and write its result."),
     (WORK, "tune", "tune:tune", "Search the thresholds that fit walks of known length best."),
     (WORK, "study", "study:study", "Compare estimators over many recordings, with statistics."),
     (HAND, "view", "view:view", "Show recordings on one time line in the Rerun viewer."),

@@ -21,6 +21,7 @@ from .options import (
     Common,
     Force,
     MaybeOutput,
+    Paths,
     Shown,
     Strings,
     instant,
@@ -40,6 +41,7 @@ def replay(
     start: Annotated[str | None, Parameter(name="--from")] = None,
     end: Annotated[str | None, Parameter(name="--to")] = None,
     gap: Annotated[Literal["bridge", "reset", "stop"], Shown] = "bridge",
+    calibration: Annotated[Paths, Parameter(name="--calibration")] = (),
     output: MaybeOutput = None,
     rrd: Path | None = None,
     show: bool = False,
@@ -56,11 +58,13 @@ def replay(
     path : Path
         The recording.
     estimator : str
-        Estimator to run: NAME, NAME[key=value,…] or LABEL=NAME[…]; may be repeated. All run in one pass.
+        Estimator to run: NAME, NAME[key=value,…], LABEL=NAME[…], or a chain A+B; may be repeated. All run in
+        one pass.
     param : str
         key=value for every estimator that has this parameter; may be repeated.
     inputs : str
-        Topic to attach to; may be repeated. Without it, every channel of the estimator's kind, one run each.
+        ROLE=TOPIC, or a topic to attach to; may be repeated. Without it, every channel of the estimator's kind,
+        one run each.
     speed : str
         max, or a factor of real time such as 1 or 2.5.
     start : str
@@ -69,6 +73,8 @@ def replay(
         Stop before here; written like --from.
     gap : str
         What a pause of the input does: bridge it, reset the estimator after it, or stop before it.
+    calibration : Path
+        File of `marcha calibrate`, handed to the estimators; may be repeated.
     output : Path
         Recording to write: everything that was in the input, and the estimates.
     rrd : Path
@@ -100,6 +106,7 @@ def replay(
             overwrite=force,
             sinks=sinks,
             gap=gap,
+            calibrations=[rp.load_calibration(c) for c in calibration],
             keep_tables=output is None,  # with a file, memory stays bounded and metrics come from there
             progress=report,
         )

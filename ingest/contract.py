@@ -290,6 +290,9 @@ class Importer(Protocol):
     joins : bool
         Whether several inputs given together are pieces of one recording, in the order given. Optional; false
         where it is missing.
+    beside : bool
+        Whether several inputs given together stand beside each other in one recording, each with its own
+        clock. Optional; false where it is missing.
     folders : bool
         Whether a folder or archive can be one recording although ``sniff`` does not know it. Optional; false
         where it is missing.

@@ -23,6 +23,8 @@ from .contract import (
     Report,
     SourceAttachment,
 )
+from .legchecks import LegWatch
+from .mapping import mapping_format
 from .truth import Truth, as_text, read_truth
 
 T = TypeVar("T")
@@ -63,15 +65,18 @@ def convert(
     Parameters
     ----------
     paths : path or sequence of paths
-        File, folder or zip archive; several only where the format's files are pieces of one recording.
+        File, folder or zip archive. Several become one recording: pieces of it where the format joins them,
+        else sources beside each other, each on its own clock (metadata record ``clocks``).
     out : path
         The recording; appears whole or not at all.
     format : str, optional
         Name of the format; without it content decides.
     mapping : path, optional
-        TOML mapping of a table's columns; implies the format ``table``.
+        TOML mapping of a table's columns. The file is of the format ``table``, or of ``exo-csv`` where the
+        mapping names segments; of several inputs the mapping belongs to those that no other format knows.
     options : mapping, optional
-        The format's options (``marcha formats``), values also as text.
+        The format's options (``marcha formats``), values also as text; of several formats
+        ``format.option`` names one.
     strict : bool
         Fail where a row would be dropped or repaired.
     overwrite : bool
@@ -90,10 +95,12 @@ def convert(
     for k, path in enumerate(sources):
         if any(path.resolve() == earlier.resolve() for earlier in sources[:k]):
             raise UsageError(f"{path}: given twice; name each input once")
+    mapped = None
     if mapping is not None:
-        if format not in (None, "table"):
-            raise UsageError(f"--map belongs to the format table, not to {format}")
-        format, chosen["mapping"] = "table", str(mapping)
+        chosen["mapping"], mapped = str(mapping), mapping_format(Path(mapping))
+        if format not in (None, "table", "exo-csv"):
+            raise UsageError(f"--map belongs to the formats table and exo-csv, not to {format}")
+        format = format or (mapped if len(sources) == 1 else None)
     if out.is_dir():
         raise MarchaError(f"{out}: is a folder; give the name of the recording to write")
     if out.exists() and any(s.exists() and out.samefile(s) for s in sources):
@@ -101,60 +108,133 @@ def convert(
     if out.exists() and not overwrite:
         raise OutputExists(out)
     with contextlib.ExitStack() as stack:
-        registered, files = registry.choose(sources, format, stack)
-        settings = registry.make_options(registered.importer, chosen)
-        truth = read_truth(files[0])
+        found = registry.choose(sources, format, stack, mapped=mapped)
+        settings = registry.share_options(found, chosen)
+        truths = [read_truth(source.files[0]) for source in found]
         facts = {
-            "importer": registered.importer.name,
-            "importer_version": registered.source,
+            "importer": ", ".join(dict.fromkeys(r.importer.name for r, _ in found)),
+            "importer_version": ", ".join(dict.fromkeys(r.source for r, _ in found)),
             "options": chosen,
             "given": ", ".join(p.name for p in sources),
         }
-        hashed = [p for _, p in _files([*files, *(truth.files if truth else ())])]
-        origin = stack.enter_context(helpers("hash", 1)).submit(provenance, hashed, **facts)
-        imported = registered.importer.read(files, settings)
-        if strict:
-            imported.refuse_changes(files[0])
+        read = [p for (_, files), truth in zip(found, truths, strict=True) for p in _read(files, truth)]
+        origin = stack.enter_context(helpers("hash", 1)).submit(provenance, read, **facts)
         try:
             with mr.create(out, overwrite=overwrite) as recording:
-                written = _Writer(recording, settings, progress)
-                for spec in imported.channels:
-                    written.declare(spec)
-                with contextlib.closing(Ahead(imported.blocks(), "parse")) as blocks:
-                    for topic, table in blocks:
-                        written.add(topic, table)
-                report = imported.report
-                for spec, table in truth.tables if truth else ():
-                    written.declare(spec)
-                    written.add(spec.topic, table)
-                records = _metadata(imported, settings, truth, report) | {"provenance": origin.result()}
-                for name, record in records.items():
+                merged = _Merged(len(found))
+                written = _Writer(recording, progress)
+                for source, setting, truth in zip(found, settings, truths, strict=True):
+                    imported = source.registered.importer.read(source.files, setting)
+                    if strict:
+                        imported.refuse_changes(source.files[0])
+                    merged.add(source, setting, truth, imported, written)
+                report = merged.report()
+                for name, record in (merged.records(report) | {"provenance": origin.result()}).items():
                     recording.add_metadata(name, record)
-                for item in [*imported.attachments, *(_raw(files) if settings.keep_source else ())]:
+                for item in merged.attachments:
                     recording.add_attachment(item.name, item.data, item.media_type)
         except OSError as error:
             where = error.filename or out
             raise MarchaError(f"{where}: {error.strerror or error}; nothing was written to {out}") from error
-    return Converted(str(out), registered.importer.name, written.channels(), report)
+    return Converted(str(out), facts["importer"], written.channels(), report)
+
+
+class _Merged:
+    """What the sources of one recording say: their channels, reports, metadata and attachments."""
+
+    def __init__(self, count: int) -> None:
+        self._several = count > 1
+        self._reports: list[tuple[str, Report]] = []
+        self._records: dict[str, dict[str, str]] = {}
+        self._clocks: dict[str, str] = {}
+        self.attachments: list[SourceAttachment] = []
+
+    def add(
+        self,
+        source: registry.Chosen,
+        options: CommonOptions,
+        truth: Truth | None,
+        imported: Import,
+        written: _Writer,
+    ) -> None:
+        """Stream one source into the recording."""
+        name = source.files[0].name
+        written.begin(options, name, len(self._reports))
+        for spec in imported.channels:
+            written.declare(spec)
+        watch = LegWatch(imported.channels)
+        with contextlib.closing(Ahead(imported.blocks(), "parse")) as blocks:
+            for topic, table in blocks:
+                watch.feed(topic, table)
+                written.add(topic, table)
+        self._reports.append((name, watch.finish(imported.report)))
+        specs = [*imported.channels, *(spec for spec, _ in truth.tables)] if truth else imported.channels
+        for spec, table in truth.tables if truth else ():
+            written.declare(spec)
+            written.add(spec.topic, table)
+        self._clocks |= {spec.topic: name for spec in specs} | imported.metadata.pop("clocks", {})
+        for key, record in _metadata(imported, options, truth).items():
+            self._records[key if key not in self._records else f"{key}/{name}"] = record
+        raw = _raw(source.files) if options.keep_source else ()
+        self.attachments += [*imported.attachments, *raw]
+
+    def report(self) -> Report:
+        """Return the report of all sources; of several a finding names its file."""
+        if not self._several:
+            return self._reports[0][1]
+        counts = {
+            key: sum(getattr(r, key) for _, r in self._reports)
+            for key in ("rows_read", "rows_kept", "rows_repaired", "rows_dropped")
+        }
+        findings = [
+            f if name in f.detail else msgspec.structs.replace(f, detail=f"{name}: {f.detail}")
+            for name, r in self._reports
+            for f in r.findings
+        ]
+        return Report(**counts, findings=findings, lossy=any(r.lossy for _, r in self._reports))
+
+    def records(self, report: Report) -> dict[str, dict[str, str]]:
+        """Return all metadata records but the provenance."""
+        records = dict(self._records)
+        if len(set(self._clocks.values())) > 1:
+            records["clocks"] = self._clocks
+        keys = ("rows_read", "rows_kept", "rows_repaired", "rows_dropped")
+        records["import_report"] = {
+            **{key: str(getattr(report, key)) for key in keys},
+            "lossy": as_text(report.lossy),
+            "findings": msgspec.json.encode(report.findings).decode(),
+        }
+        return records
 
 
 class _Writer:
     """Hands tables to the recording, moved to UTC where asked, and counts them."""
 
-    def __init__(
-        self, recording: Any, options: CommonOptions, progress: Callable[[int], None] | None
-    ) -> None:
+    def __init__(self, recording: Any, progress: Callable[[int], None] | None) -> None:
         self._recording = recording
         self._progress = progress
         self._total = 0
+        self._start: int | None = None
+        self._shift = 0
+        self._source = (0, "")
+        self._from: dict[str, tuple[int, str]] = {}
+        self._specs: dict[str, ChannelSpec] = {}
+        self._counts: dict[str, tuple[int, int | None, int | None]] = {}
+
+    def begin(self, options: CommonOptions, source: str, number: int) -> None:
+        """Start a source: its clock is moved as its options say."""
+        self._source = (number, source)
         self._start = None if options.start is None else _instant("start", options.start)
         self._shift = 0 if options.epoch is None else _instant("epoch", options.epoch)
         if options.start is not None and options.epoch is not None:
             raise UsageError("start and epoch both say when the device's clock began; give one")
-        self._specs: dict[str, ChannelSpec] = {}
-        self._counts: dict[str, tuple[int, int | None, int | None]] = {}
 
     def declare(self, spec: ChannelSpec) -> None:
+        if (other := self._from.setdefault(spec.topic, self._source)) != self._source:
+            raise MarchaError(
+                f"{self._source[1]}: {spec.topic} comes from {other[1]} already; give one of them other names "
+                "(--set FORMAT.segments=…), or convert them one by one"
+            )
         self._specs[spec.topic] = spec
         self._counts[spec.topic] = (0, None, None)
         self._recording.add_channel(
@@ -208,7 +288,6 @@ def _metadata(
     imported: Import,
     options: CommonOptions,
     truth: Truth | None,
-    report: Report,
 ) -> dict[str, dict[str, str]]:
     records = {name: dict(record) for name, record in imported.metadata.items()}
     if options.epoch is not None or options.start is not None:
@@ -219,12 +298,12 @@ def _metadata(
             known[key] = as_text(value)
     if known:
         records["truth"] = records.get("truth", {}) | known
-    records["import_report"] = {
-        **{k: str(getattr(report, k)) for k in ("rows_read", "rows_kept", "rows_repaired", "rows_dropped")},
-        "lossy": as_text(report.lossy),
-        "findings": msgspec.json.encode(report.findings).decode(),
-    }
     return records
+
+
+def _read(files: Sequence[Path], truth: Truth | None) -> Iterator[Path]:
+    """Yield every file that a source is read from."""
+    yield from (p for _, p in _files([*files, *(truth.files if truth else ())]))
 
 
 def _files(paths: Sequence[Path]) -> Iterator[tuple[str, Path]]:

@@ -54,7 +54,7 @@ class Layout(Strict, frozen=True, kw_only=True):
 
 
 class Time(Strict, frozen=True, kw_only=True):
-    """Where time comes from: a column, or a rate.
+    """Where time comes from: a column, a rate, or both: a column that counts samples of that rate.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Time(Strict, frozen=True, kw_only=True):
     format : str
         Of a ``datetime`` (chrono: ``%Y-%m-%d %H:%M:%S%.3f``); default ISO 8601.
     rate_hz : float
-        Rows per second, instead of a column.
+        Rows per second, instead of a column; beside one, what it counts per second.
     clock : str
         ``device``: its own zero; ``unix``: since 1970 UTC; ``utc``: dates in UTC.
     rollover : int
@@ -203,8 +203,8 @@ def read_mapping(path: Path) -> Mapping:
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise MarchaError(f"{path}: not TOML: {error}") from error
     time = mapping.time
-    if (time.column is None) == (time.rate_hz is None):
-        raise MarchaError(f"{path}: time: give either time.column or time.rate_hz")
+    if time.column is None and time.rate_hz is None:
+        raise MarchaError(f"{path}: time: give time.column, time.rate_hz, or both for a counter of samples")
     if isinstance(time.column, str) and not mapping.layout.header:
         raise MarchaError(f"{path}: time.column: {time.column!r} is a name, but layout.header is false")
     separator = mapping.layout.separator
@@ -218,6 +218,15 @@ def read_mapping(path: Path) -> Mapping:
     for i, topic in enumerate(mapping.topic):
         targets(path, mapping, i, topic)
     return mapping
+
+
+def mapping_format(path: Path) -> str:
+    """Return the format that a mapping file speaks of: ``exo-csv`` where it names segments, else ``table``."""
+    try:
+        document = msgspec.toml.decode(path.read_bytes())
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError):
+        return "table"  # reading it will say what is wrong
+    return "exo-csv" if "segment" in document and "topic" not in document else "table"
 
 
 def schema_name(topic: Topic) -> str:

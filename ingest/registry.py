@@ -173,12 +173,21 @@ def recognise(path: Path) -> list[Candidate]:
     return sorted(found, key=lambda c: -c.confidence)
 
 
-def choose(
-    paths: Sequence[Path], format: str | None, stack: contextlib.ExitStack
-) -> tuple[Registered, list[Path]]:
-    """Find the importer of a source, and the files or folders to hand to it.
+class Chosen(NamedTuple):
+    """One source of a recording: an importer and the files or folders that it reads together."""
 
-    A folder is first offered whole, then its files; a zip archive is unpacked and taken for a folder.
+    registered: Registered
+    files: list[Path]
+
+
+def choose(
+    paths: Sequence[Path], format: str | None, stack: contextlib.ExitStack, *, mapped: str | None = None
+) -> list[Chosen]:
+    """Find the importers of a recording's sources, and the files or folders to hand to each.
+
+    A folder is first offered whole, then its files; a zip archive is unpacked and taken for a folder. Inputs
+    of different formats stand beside each other in one recording, each a source of its own; so do several
+    of one format whose importer says so (``beside``), while one that joins them reads them as one source.
 
     Parameters
     ----------
@@ -188,32 +197,69 @@ def choose(
         Name of the format; without it content decides.
     stack : contextlib.ExitStack
         Keeps unpacked archives until it is closed.
+    mapped : str, optional
+        Format of inputs whose content belongs to none: that of a mapping which was given.
 
     Raises
     ------
     MarchaError
-        Nothing there, unknown or ambiguous content, or several inputs that are not pieces of one recording.
+        Nothing there, unknown or ambiguous content, or several inputs of a format that takes one.
     """
     if not paths:
         raise UsageError("nothing to convert: give at least one file, folder or zip archive")
     wanted = get(format) if format else None
     chosen: list[tuple[str, Path]] = []
     for path in paths:
-        chosen += _resolve(Path(path), wanted, stack)
-    names = sorted({name for name, _ in chosen})
-    if len(names) > 1:
-        pairs = ", ".join(f"{p.name} is {n}" for n, p in chosen[:4])
-        raise MarchaError(
-            f"{paths[0]}: the inputs are of different formats ({pairs}); convert them one by one"
-        )
-    registered = get(names[0])
-    files = [p for _, p in chosen]
-    if len(files) > 1 and not (getattr(registered.importer, "joins", False) and len(paths) > 1):
-        raise MarchaError(
-            f"{paths[0]}: {len(files)} recordings of format {names[0]} "
-            f"({', '.join(p.name for p in files[:3])} …); convert them one by one"
-        )
-    return registered, files
+        if mapped is not None and Path(path).is_file() and not recognise(Path(path)):
+            chosen.append((mapped, Path(path)))
+        else:
+            chosen += _resolve(Path(path), wanted, stack)
+    sources: list[Chosen] = []
+    for name in dict.fromkeys(name for name, _ in chosen):
+        registered = get(name)
+        files = [p for n, p in chosen if n == name]
+        if len(files) == 1 or (getattr(registered.importer, "joins", False) and len(paths) > 1):
+            sources.append(Chosen(registered, files))
+        elif getattr(registered.importer, "beside", False) and len(paths) > 1:
+            sources += [Chosen(registered, [file]) for file in files]
+        else:
+            raise MarchaError(
+                f"{files[0]}: {len(files)} recordings of format {name} "
+                f"({', '.join(p.name for p in files[:3])} …); convert them one by one"
+            )
+    return sources
+
+
+def share_options(sources: Sequence[Chosen], values: Mapping[str, Any]) -> list[CommonOptions]:
+    """Return the options of each source.
+
+    ``name=value`` goes to every source whose format has the option, ``start`` and ``epoch`` to the first
+    only: they speak of one clock; ``format.name=value`` goes to the sources of that format.
+
+    Raises
+    ------
+    UsageError
+        An option is unknown to all of them, or its value does not fit.
+    """
+    if len(sources) == 1 and not any(
+        key.startswith(f"{sources[0].registered.importer.name}.") for key in values
+    ):
+        return [make_options(sources[0].registered.importer, values)]
+    given: list[dict[str, Any]] = [{} for _ in sources]
+    for key, value in values.items():
+        takers = []
+        for k, (registered, _) in enumerate(sources):
+            importer = registered.importer
+            name = key.removeprefix(f"{importer.name}.")
+            known = {f.name for f in msgspec.structs.fields(importer.Options)}
+            if name in known and not (name == key and k > 0 and key in ("start", "epoch")):
+                takers.append((k, name))
+        if not takers:
+            formats = ", ".join(dict.fromkeys(r.importer.name for r, _ in sources))
+            raise UsageError(f"option {key!r}: none of the formats {formats} has it; see marcha formats")
+        for k, name in takers:
+            given[k][name] = value
+    return [make_options(r.importer, chosen) for (r, _), chosen in zip(sources, given, strict=True)]
 
 
 def _resolve(path: Path, wanted: Registered | None, stack: contextlib.ExitStack) -> list[tuple[str, Path]]:

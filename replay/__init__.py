@@ -2,6 +2,8 @@
 
 from .alignment import ALIGNMENTS, align
 from .api import replay
+from .attachment import NOT_RAW, Attachment
+from .calibrations import calibrate, load_calibration, save_calibration
 from .clock import Clock, ManualClock, SystemClock
 from .engine import Engine, ReplayResult, Run
 from .evaluate import (
@@ -10,7 +12,7 @@ from .evaluate import (
     check_thresholds,
     evaluate,
 )
-from .feed import GapPolicy
+from .gaps import GapPolicy
 from .metrics import RunView, Truth, nees_bounds
 from .plan import (
     EstimatorSpec,
@@ -32,6 +34,8 @@ from .tuning import Tuned, tune
 
 __all__ = [
     "ALIGNMENTS",
+    "NOT_RAW",
+    "Attachment",
     "Batch",
     "Clock",
     "Engine",
@@ -57,11 +61,14 @@ __all__ = [
     "Truth",
     "Tuned",
     "align",
+    "calibrate",
     "check_thresholds",
     "evaluate",
+    "load_calibration",
     "nees_bounds",
     "parse_estimator",
     "plan_runs",
     "replay",
+    "save_calibration",
     "tune",
 ]

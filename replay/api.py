@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+from ..algorithms.calibration import Calibration
 from ..recording import Recording
 from ..recording import open as open_recording
 from ..recording.errors import OutputExists, UsageError
@@ -20,7 +20,7 @@ from .engine import (
     Run,
 )
 from .evaluate import evaluate, evaluate_run, recording_view
-from .feed import GapPolicy
+from .gaps import GapPolicy, Gaps
 from .plan import EstimatorLike, plan_runs
 from .sinks import RecordingSink, Sink, TableSink
 from .sources import RecordingSource, Source, SourceFailed
@@ -38,12 +38,13 @@ def replay(
     out: Path | str | None = None,
     overwrite: bool = False,
     mode: Literal["block", "sample"] = "block",
-    gap: GapPolicy | str | None = None,
+    gap: Gaps | str | None = None,
     sinks: Sequence[Sink] = (),
     keep_tables: bool = True,
     metrics: bool = True,
     clock: Clock | None = None,
     progress: Progress | None = None,
+    calibrations: Sequence[Calibration] = (),
     max_rows: int = 65_536,
 ) -> ReplayResult:
     """Feed a recording (or a live source) to estimators, as if it happened now, and keep what they say.
@@ -58,7 +59,7 @@ def replay(
     params : mapping, optional
         Parameters for every estimator that has them; those in the brackets of a name win.
     inputs : sequence of str, optional
-        Topics to attach to; without it every raw channel of an estimator's kind, one run each.
+        ``role=topic``, or topics alone; without it every raw channel of an estimator's kind, one run each.
     speed : "max" or float
         Factor of real time. The results have the same bits at any speed.
     start_ns, end_ns : int, optional
@@ -70,7 +71,8 @@ def replay(
     mode : {"block", "sample"}
         Whole blocks through the estimators that take them, or one step a sample. Same bits.
     gap : GapPolicy or str
-        What happens when the first input of an estimator pauses: ``bridge`` (default), ``reset`` or ``stop``.
+        What happens when a regular input of an estimator pauses: ``bridge`` (default), ``reset`` or ``stop``;
+        or a mapping from the names of inputs to policies.
     sinks : sequence of Sink
         Further observers: a viewer, a file, a test.
     keep_tables : bool
@@ -82,6 +84,8 @@ def replay(
         Paces the replay.
     progress : callable, optional
         Called with nanoseconds done and in all.
+    calibrations : sequence of Calibration
+        Handed to estimators, before those that the recording has.
     max_rows : int
         Rows of a block.
 
@@ -110,18 +114,18 @@ def replay(
             raise OutputExists(target)
     taken = [n.removeprefix("run/") for n in rec.metadata if n.startswith("run/")] if rec is not None else []
     taken += {t.split("/")[2] for t in source.channels if t.startswith("/estimate/") and t.count("/") > 2}
-    runs = plan_runs(source, estimators, params, inputs, taken)
+    runs = plan_runs(source, estimators, params, inputs, taken, calibrations)
     tables = TableSink() if keep_tables else None
     own: list[Sink] = [
         s for s in (tables, RecordingSink(target, rec, overwrite) if target else None) if s is not None
     ]
-    digest = _Digest(Path(rec.path)) if rec is not None and target is not None else None
 
     def complete(done: list[Run]) -> None:
+        digest = hash_file(Path(rec.path)) if rec is not None and target is not None else ""
         for run in done:
             run.lineage["input_recording"] = source.name
-            if digest is not None:
-                run.lineage["input_blake2b"] = digest.result()
+            if digest:
+                run.lineage["input_blake2b"] = digest
             if tables is not None:
                 kept = {name: tables.table(topic) for name, topic in run.outputs.items()}
                 run.tables = {name: t for name, t in kept.items() if t is not None}
@@ -162,26 +166,3 @@ def replay(
         for run in result.runs:
             run.metrics, run.alignment = evaluated[run.run].metrics, evaluated[run.run].alignment
     return result
-
-
-class _Digest:
-    """BLAKE2b of a file, worked out beside the replay."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._result: str | BaseException = ""
-        self._thread = threading.Thread(target=self._run, daemon=True, name="digest")
-        self._thread.start()
-
-    def _run(self) -> None:
-        try:
-            self._result = hash_file(self._path)
-        except BaseException as error:  # raised where the result is asked for
-            self._result = error
-
-    def result(self) -> str:
-        """Wait for it."""
-        self._thread.join()
-        if isinstance(self._result, BaseException):
-            raise self._result
-        return self._result

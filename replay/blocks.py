@@ -1,4 +1,4 @@
-"""Results on their way from an estimator to the sinks."""
+"""Results on their way from an estimator to the sinks and to other estimators."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from ..algorithms.contract import FloatArray
+from ..algorithms.contract import FloatArray, IntArray
 
 Columns = dict[str, NDArray[Any]]
 
@@ -34,10 +34,13 @@ class Block:
     ----------
     rows : dict of str to ndarray, or polars.DataFrame
         ``t_ns``, ``t_log_ns`` and columns.
+    keys : ndarray of int64, optional
+        Of a run's results: places in the order of messages of those that caused them.
     """
 
-    def __init__(self, rows: Columns | pl.DataFrame) -> None:
+    def __init__(self, rows: Columns | pl.DataFrame, keys: IntArray | None = None) -> None:
         self.rows = rows
+        self.keys = keys
 
     def __len__(self) -> int:
         return self.rows.height if isinstance(self.rows, pl.DataFrame) else len(self.rows["t_ns"])
@@ -60,4 +63,13 @@ def joined(blocks: list[Block]) -> Block:
     """Return the blocks of one topic as one; at least one."""
     if len(blocks) == 1:
         return blocks[0]
-    return Block(pl.concat([b.table for b in blocks]))
+    keys = [b.keys for b in blocks if b.keys is not None]
+    return Block(pl.concat([b.table for b in blocks]), np.concatenate(keys) if keys else None)
+
+
+def joined_by_name(parts: list[dict[str, Block]]) -> dict[str, Block]:
+    """Return the blocks of several parts, one by name."""
+    if len(parts) == 1:
+        return parts[0]
+    names = dict.fromkeys(n for given in parts for n in given)
+    return {n: joined([given[n] for given in parts if n in given]) for n in names}

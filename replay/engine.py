@@ -9,17 +9,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 import polars as pl
 
 from ..recording.errors import Finding, UsageError
 from ..recording.provenance import environment
 from ..recording.threads import Ahead
-from .blocks import Block
+from .blocks import Block, joined_by_name
+from .calibrations import corrections
 from .clock import Clock, SystemClock
-from .feed import Feed, GapPolicy, Merged
+from .gaps import GapPolicy, Gaps, policy_of
+from .merging import LEVELS, Merged, Part
+from .messages import MessageFeed
 from .plan import Plan, PlannedRun
-from .runs import Runner
+from .rows import RowFeed
+from .runs import Runner, runner_of
 from .sinks import RecordingSink, Sink
 from .sources import Batch, Source
 
@@ -40,8 +45,8 @@ class Run:
         Id.
     estimator, version, input : str
         Name, distribution and version, topic of the first input.
-    inputs : tuple of (str or None)
-        Topics of all inputs.
+    inputs : dict of str to tuple of str
+        Topics by the name of the input.
     params : dict
         Every parameter.
     samples : int
@@ -72,7 +77,7 @@ class Run:
     estimator: str
     version: str
     input: str
-    inputs: tuple[str | None, ...]
+    inputs: dict[str, tuple[str, ...]]
     params: dict[str, Any]
     samples: int
     loop_s: float
@@ -155,7 +160,7 @@ class Engine:
         sinks: Sequence[Sink] = (),
         mode: Literal["block", "sample"] = "block",
         speed: float | str = "max",
-        gap: GapPolicy | None = None,
+        gap: Gaps | None = None,
         clock: Clock | None = None,
         start_ns: int | None = None,
         end_ns: int | None = None,
@@ -178,15 +183,24 @@ class Engine:
         self._progress = progress
         self._paused = threading.Event()
 
-        feeds: dict[Any, Feed] = {}
+        feeds: dict[Any, RowFeed | MessageFeed] = {}
         self.runners: list[Runner] = []
         for run in runs:
-            feed = feeds.setdefault(run.inputs, Feed(run.inputs, self.gap, run.rate_hz))
-            self.runners.append(Runner(run, feed, blocks=mode == "block"))
+            if (key := (run.takes_rows, run.inputs)) not in feeds:
+                feeds[key] = (
+                    RowFeed(run.row_inputs, policy_of(self.gap, run.inputs[0].input), run.rate_hz)
+                    if run.takes_rows
+                    else MessageFeed(run.inputs, self.gap)
+                )
+            self.runners.append(runner_of(run, feeds[key], blocks=mode == "block"))
         self._feeds = list(feeds.values())
+        served = {c.topic for r in runs for c in r.inputs}
+        self._read_by_runs = {c.topic for r in runs for c in r.outputs.values() if c.topic in served}
+        given = {(c.kind, c.subject): c for r in runs for c in r.calibrations}
+        self._corrections, self._corrected = corrections(list(given.values()), source.channels)
 
-        raw = any(getattr(s, "raw", True) for s in self.sinks)
-        read = {t for f in self._feeds for t, _ in f.inputs if t is not None}
+        raw = any(s.raw for s in self.sinks)
+        read = served
         self._topics = [t for t in source.channels if raw or t in read]
         self._raw_topics = set(source.channels) if raw else set()
         estimates = {c.topic: c for r in runs for c in r.outputs.values()}
@@ -292,8 +306,7 @@ class Engine:
         """
         self._stop_reading()
         end_ns = max(self._newest_ns, self.source.end_ns if self._end_ns is None else self._newest_ns)
-        for runner in self.runners:
-            self._emit_all(runner, runner.finish(end_ns))
+        self._drive(Part({}, {}), end_ns)
         output = next((s.path for s in self.sinks if isinstance(s, RecordingSink)), None)
         result = ReplayResult(output, [self._result(r) for r in self.runners])
         if complete is not None:
@@ -384,11 +397,9 @@ class Engine:
         for topic, table in part.tables.items():
             if topic in self._raw_topics:
                 self._emit(topic, Block(table), raw=True)
-        rows = {id(f): f.take(part) for f in self._feeds}
-        for runner in self.runners:
-            ready = rows[id(runner.feed)]
-            if len(ready):
-                self._emit_all(runner, runner.take(ready))
+            if topic in self._corrections:
+                part.tables[topic] = self._corrections[topic](table)
+        self._drive(part)
         self._cursor = last
         self._newest_ns = max(self._newest_ns, int(merged.log_ns[last - 1]))
         whole = last == len(merged)
@@ -402,9 +413,26 @@ class Engine:
             begin, end = self._begin_ns, self._end_ns if self._end_ns is not None else self.source.end_ns
             self._progress(min(newest, end) - begin if end > begin else newest, max(0, end - begin))
 
-    def _emit_all(self, runner: Runner, blocks: dict[str, Block]) -> None:
-        for name, block in blocks.items():
-            self._emit(runner.plan.outputs[name].topic, block)
+    def _drive(self, part: Part, end_ns: int | None = None) -> None:
+        """Take the messages of a part through all runs, each behind those whose outputs it reads.
+
+        ``end_ns``: these are the last ones; estimators give what they hold.
+        """
+        given: dict[int, Any] = {}
+        for level, runner in enumerate(self.runners, 1):
+            feed = runner.feed
+            if id(feed) not in given:
+                given[id(feed)] = feed.take(part)
+            ready = given[id(feed)]
+            blocks = runner.take(ready) if len(ready) else {}
+            if end_ns is not None:
+                blocks = joined_by_name([blocks, runner.finish(end_ns)])
+            for name, block in blocks.items():
+                topic = runner.plan.outputs[name].topic
+                self._emit(topic, block)
+                if topic in self._read_by_runs:
+                    assert block.keys is not None
+                    part.add(topic, block.table, block.keys // LEVELS * LEVELS + level)
 
     def _emit(self, topic: str, block: Block, raw: bool = False) -> None:
         before = self._written.get(topic, 0)
@@ -412,16 +440,11 @@ class Engine:
         known = self._seen.get(topic, 0)
         self._seen[topic] = max(known, after)
         for sink in self.sinks:
-            if raw and not getattr(sink, "raw", True):
+            if raw and not sink.raw:
                 continue
-            fresh = block if hasattr(sink, "rewind") else block.since(max(0, known - before))
-            if not len(fresh):
-                continue
-            write_block = getattr(sink, "write_block", None)
-            if write_block is not None:
-                write_block(topic, fresh)
-            else:
-                sink.write(topic, fresh.table)
+            fresh = block if sink.rewinds else block.since(max(0, known - before))
+            if len(fresh):
+                sink.write_block(topic, fresh)
 
     # -- going back ----------------------------------------------------------------------------------
 
@@ -443,9 +466,7 @@ class Engine:
         self._position_ns = checkpoint.log_ns
         self._merged, self._cursor, self._exhausted = None, 0, False
         for sink in self.sinks:
-            rewind = getattr(sink, "rewind", None)
-            if rewind is not None:
-                rewind(checkpoint.log_ns)
+            sink.rewind(checkpoint.log_ns)
 
     def _stop_reading(self) -> None:
         close = getattr(self._batches, "close", None)
@@ -459,7 +480,8 @@ class Engine:
         plan, feed = runner.plan, runner.feed
         findings, fatal = runner.findings()
         outputs = {name: c.topic for name, c in plan.outputs.items()}
-        inputs = tuple(t for t, _ in plan.inputs)
+        gap = policy_of(self.gap, plan.inputs[0].input)
+        findings = [*findings, *self._corrected] if self._corrected else findings
         lineage = {
             "run": plan.run,
             "estimator": plan.name,
@@ -467,7 +489,7 @@ class Engine:
             "environment": environment(),
             "source": str(getattr(plan.estimator, "source", "")),
             "input": plan.input,
-            "inputs": json.dumps(inputs),
+            "inputs": json.dumps(plan.topics),
             "params": json.dumps(plan.params),
             **{f"param.{k}": v if isinstance(v, str) else json.dumps(v) for k, v in plan.params.items()},
             "outputs": json.dumps(outputs),
@@ -475,12 +497,13 @@ class Engine:
             "offline": json.dumps(plan.offline),
             "rate_hz": f"{plan.rate_hz:.6g}",
             "mode": self.mode,
-            "gap.policy": self.gap.policy,
-            "gap.max_gap_s": f"{feed.limit_s:g}",
+            "gap.policy": gap.policy,
+            "gap.max_gap_s": f"{gap.limit_s(plan.rate_hz):g}",
             "range.start_ns": "" if self._start_ns is None else str(self._start_ns),
             "range.end_ns": "" if self._end_ns is None else str(self._end_ns),
             "samples": str(runner.samples),
-            "segments": str(feed.segments),
+            "segments": str(1 + feed.restarts),
+            **{f"calibration.{c.kind}": msgspec.json.encode(c).decode() for c in plan.calibrations},
             "loop_s": f"{runner.loop_s:.6f}",
             "fatal": json.dumps(fatal),
             "findings": json.dumps([[f.kind, f.count, f.detail] for f in findings]),
@@ -490,15 +513,15 @@ class Engine:
             plan.name,
             plan.version,
             plan.input,
-            inputs,
+            plan.topics,
             plan.params,
             runner.samples,
             runner.loop_s,
-            feed.segments,
+            1 + feed.restarts,
             outputs,
             findings,
             fatal,
-            annotations=runner.annotation_table(),
+            annotations=runner.annotations(),
             lineage=lineage,
         )
 

@@ -6,7 +6,7 @@ import copy
 import json
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib import metadata
 from typing import Any
@@ -14,21 +14,26 @@ from typing import Any
 import msgspec
 
 from ..algorithms import find, make
+from ..algorithms.calibration import Calibration
 from ..algorithms.contract import (
+    ALL_COLUMNS,
     AlgorithmError,
+    ChannelInfo,
+    Context,
     Estimator,
-    Input,
     Output,
     PlainEstimator,
+    RowEstimator,
 )
 from ..recording.errors import Finding, UsageError
+from .attachment import Attachment, Chosen, attach, device_of, serving
+from .calibrations import calibrations_of
+from .messages import AttachedChannel
 from .sources import PlannedChannel, Source
 
 _SPEC = re.compile(
     r"^(?:(?P<label>[A-Za-z0-9_-]+)=)?(?P<name>[^\[\]=\s]+)(?:\[(?P<params>.*)\])?$", re.DOTALL
 )
-NOT_RAW = ("/reference/", "/estimate/", "/annotation/")
-"""Topics that an estimator never takes on its own."""
 
 
 class EstimatorSpec(msgspec.Struct, frozen=True):
@@ -85,15 +90,15 @@ def parse_value(text: str) -> Any:
         return text
 
 
-def _split(text: str) -> list[str]:
-    """Split at commas outside of brackets and quotes."""
+def _split(text: str, separator: str = ",") -> list[str]:
+    """Split at a separator outside of brackets and quotes."""
     parts, depth, quoted, start = [], 0, False, 0
     for i, sign in enumerate(text):
         if sign == '"':
             quoted = not quoted
         elif not quoted:
             depth += (sign in "[{") - (sign in "]}")
-            if sign == "," and depth == 0:
+            if sign == separator and depth == 0:
                 parts.append(text[start:i])
                 start = i + 1
     parts.append(text[start:])
@@ -109,38 +114,49 @@ class PlannedRun:
     run : str
         Id, also the part of the topics that tells runs apart.
     estimator : Estimator
-        Fresh instance, used by this run only.
+        Fresh instance, used by this run only; its ``start`` is through.
     name : str
         The estimator's name.
     version : str
         Distribution and version that the estimator comes from.
     params : dict
         Every parameter with its value.
-    inputs : tuple of (str or None, tuple of str)
-        Topic and columns of every input; None for an optional one that is not there.
+    inputs : tuple of AttachedChannel
+        Channels of all inputs, in the order of the inputs.
     rate_hz : float
         Rate of the first input; 0 where it is not known.
     outputs : dict of str to PlannedChannel
         Channel of every output.
     findings : tuple of Finding
         What the user must know before the run.
+    calibrations : tuple of Calibration
+        Those that it was given.
+    stage_of : tuple of str
+        Runs that read its outputs.
     """
 
     run: str
-    estimator: Estimator
+    estimator: Any
     name: str
     version: str
     params: dict[str, Any]
-    inputs: tuple[tuple[str | None, tuple[str, ...]], ...]
+    inputs: tuple[AttachedChannel, ...]
     rate_hz: float
     outputs: dict[str, PlannedChannel]
-    findings: tuple[Finding, ...] = field(default=())
+    findings: tuple[Finding, ...] = ()
+    calibrations: tuple[Calibration, ...] = ()
 
     @property
     def input(self) -> str:
-        """Topic of the first input."""
-        assert self.inputs[0][0] is not None
-        return self.inputs[0][0]
+        """Topic of the first channel."""
+        return self.inputs[0].topic
+
+    @property
+    def topics(self) -> dict[str, tuple[str, ...]]:
+        """Topics by input; empty for an optional one that is not there."""
+        return {
+            i.name: tuple(c.topic for c in self.inputs if c.input == i.name) for i in self.estimator.inputs
+        }
 
     @property
     def latency(self) -> int:
@@ -151,6 +167,27 @@ class PlannedRun:
     def offline(self) -> bool:
         """Whether the estimator sees the whole recording before it answers."""
         return bool(getattr(self.estimator, "offline", False))
+
+    @property
+    def takes_rows(self) -> bool:
+        """Whether it is fed rows, not messages."""
+        return takes_rows(self.estimator)
+
+    @property
+    def row_inputs(self) -> tuple[tuple[str | None, tuple[str, ...]], ...]:
+        """Topic and columns of every input of an estimator that takes rows; None for one that is not there."""
+        return tuple(
+            (next(iter(topics), None), i.columns)
+            for i, topics in zip(self.estimator.inputs, self.topics.values(), strict=True)
+        )
+
+
+def takes_rows(estimator: Any) -> bool:
+    """Return whether an estimator is fed rows (``step``), not messages (``take``)."""
+    if isinstance(estimator, RowEstimator):
+        return True
+    own = getattr(type(estimator), "take", None)
+    return own is None or (own is PlainEstimator.take and callable(getattr(estimator, "step", None)))
 
 
 @dataclass(frozen=True)
@@ -164,7 +201,7 @@ class Plan:
     channels : dict of str to PlannedChannel
         Raw and estimate channels that will come, by topic.
     runs : tuple of PlannedRun
-        The runs.
+        The runs; one that reads another's outputs comes after it.
     """
 
     source: str
@@ -178,75 +215,225 @@ def plan_runs(
     params: Mapping[str, Any] | None = None,
     inputs: Sequence[str] | None = None,
     taken: Sequence[str] = (),
+    calibrations: Sequence[Calibration] = (),
 ) -> tuple[PlannedRun, ...]:
-    """Decide which estimators run on which channels.
+    """Decide which estimators run on which channels; see :mod:`.attachment` for the rule.
 
     Parameters
     ----------
     source : Source
         Where the messages will come from.
     estimators : sequence
-        Names (``foot.9iez``, ``slow=foot.9iez[sigma_acc=0.01]``), or classes or instances of one's own.
+        Names (``foot.9iez``, ``slow=foot.9iez[sigma_acc=0.01]``), chains of them (``phone.steps+phone.pdr``), or
+        classes or instances of one's own.
     params : mapping, optional
         Parameters for every estimator that has them; those in the brackets of a name win.
     inputs : sequence of str, optional
-        Topics to attach to. Without it every raw channel of the estimator's kind, one run each.
+        ``role=topic``, or topics alone. Without it every raw channel of the estimator's kind, one run each.
     taken : sequence of str
         Run ids that exist already; a new run of the same id gets a number and says so.
+    calibrations : sequence of Calibration
+        Handed to estimators, before those that the recording has.
 
     Raises
     ------
     UsageError
-        Unknown names, parameters or topics; no channel that fits; a missing column.
+        Unknown names, parameters or topics; no channel that fits; a missing column; a circle of stages.
     """
     if not estimators:
         raise UsageError("no estimator given; `marcha estimators` lists them")
     params = dict(params or {})
-    makers = [_Maker(e, params) for e in estimators]
-    unused = [p for p in params if not any(p in m.shared for m in makers)]
+    chains = [[_Maker(e, params) for e in _chain(asked)] for asked in estimators]
+    makers = [m for c in chains for m in c]
+    chosen = Chosen.parse(inputs or ())
+    planner = _Planner(source, params, chosen, taken, calibrations)
+    stages = [s for m in makers for s in planner.default_stages(m)]
+    unused = [p for p in params if not any(p in m.shared for m in (*makers, *stages))]
     if unused:
         raise UsageError(f"parameter {unused[0]}: none of the estimators {[m.name for m in makers]} has it")
-    for topic in inputs or ():
-        if topic not in source.channels:
+    chosen.check(source, (i.name for m in (*makers, *stages) for i in m.estimator.inputs))
+    for chain in chains:
+        planner.add_chain(chain)
+    return tuple(planner.runs)
+
+
+def _chain(asked: EstimatorLike) -> Sequence[EstimatorLike]:
+    """Return the stages of what the user asked for."""
+    return _split(asked, "+") if isinstance(asked, str) else [asked]
+
+
+class _Planner:
+    """Attaches one chain after another; stages that are alike are planned once."""
+
+    def __init__(
+        self,
+        source: Source,
+        params: Mapping[str, Any],
+        chosen: Chosen,
+        taken: Sequence[str],
+        calibrations: Sequence[Calibration],
+    ) -> None:
+        self.source = source
+        self.params = params
+        self.chosen = chosen
+        self.taken = tuple(taken)
+        self.given = tuple(calibrations)
+        self.runs: list[PlannedRun] = []
+
+    def default_stages(self, maker: _Maker, above: tuple[str, ...] = ()) -> list[_Maker]:
+        """Return the estimators that serve this one's inputs unless others are named, nearest last."""
+        if maker.name in above:
+            raise UsageError(f"estimators serve one another in a circle: {' → '.join((*above, maker.name))}")
+        found: list[_Maker] = []
+        for need in maker.estimator.inputs:
+            if need.stage:
+                stage = _Maker(need.stage, self.params)
+                found += [*self.default_stages(stage, (*above, maker.name)), stage]
+        return found
+
+    def add_chain(self, chain: Sequence[_Maker]) -> None:
+        """Plan the runs of a chain."""
+        offers: list[PlannedChannel] = []
+        for place, maker in enumerate(chain):
+            planned = self.add(maker, offers, "", own=place == len(chain) - 1)
+            offers += [c for run in planned for c in run.outputs.values()]
+
+    def add(
+        self, maker: _Maker, offers: Sequence[PlannedChannel], device: str, own: bool = True
+    ) -> list[PlannedRun]:
+        """Plan the runs of one estimator behind the outputs ``offers``; ``own``: the user asked for it by itself."""
+        inputs = maker.estimator.inputs
+        served: dict[str, PlannedChannel] = {}
+        for need in inputs:
+            if need.name in self.chosen.roles:
+                continue
+            channel = serving(need, offers, maker.name)
+            if channel is not None:
+                served[need.name] = channel
+        staged = [i for i in inputs if i.stage and i.name not in served and i.name not in self.chosen.roles]
+        attachments = (
+            attach(
+                [i for i in inputs if i not in staged], maker.name, self.source, self.chosen, served, device
+            )
+            if len(staged) < len(inputs)
+            else [Attachment({})]
+        )
+        planned: list[PlannedRun] = []
+        for attachment in attachments:
+            channels, notes = dict(attachment.channels), list(attachment.findings)
+            raw = [c.topic for attached in channels.values() for c in attached if not c.run]
+            beside = device_of(raw[0]) if raw else device
+            behind: list[dict[str, tuple[PlannedChannel, ...]]] = [{}]
+            for need in staged:
+                stage = _Maker(need.stage, self.params)
+                runs = self.add(stage, offers, beside, own=False)
+                offered = [serving(need, list(r.outputs.values()), maker.name) for r in runs]
+                fitting = [c for c in offered if c is not None]
+                if not fitting:
+                    raise UsageError(
+                        f"estimator {maker.name}: its stage {need.stage} has no output that fits input {need.name}"
+                    )
+                if raw or len(behind) > 1:
+                    fitting = fitting[:1]
+                behind = [b | {need.name: (c,)} for b in behind for c in fitting]
+            for served_by in behind:
+                whole = {i.name: (channels | served_by).get(i.name, ()) for i in inputs}
+                planned.append(self._plan(maker, Attachment(whole, tuple(notes)), own))
+        return planned
+
+    def _plan(self, maker: _Maker, attachment: Attachment, own: bool) -> PlannedRun:
+        primary, notes = attachment.primary, list(attachment.findings)
+        rate = 0.0 if primary.run else self.source.rate_hz(primary.topic)
+        estimator, values = maker.build(rate)
+        attached = tuple(
+            AttachedChannel(
+                need.name,
+                index,
+                number,
+                channel.topic,
+                channel.columns if need.columns == ALL_COLUMNS else need.columns,
+                need.regular,
+                0.0 if channel.run else self.source.rate_hz(channel.topic),
+            )
+            for index, need in enumerate(estimator.inputs)
+            for number, channel in enumerate(attachment.channels[need.name])
+        )
+        if not own:
+            for r in self.runs:
+                if (r.name, r.params, r.inputs) == (maker.name, values, attached):
+                    return r
+        parts = "_".join(p for p in _origin(primary).split("/") if p)
+        wanted = f"{_identifier(maker.label or maker.name)}_{_identifier(parts)}"
+        run = _free(wanted, {*self.taken, *(r.run for r in self.runs)})
+        if wanted in self.taken:
+            detail = f"the recording has a run {wanted} already: this one is {run}"
+            notes.append(Finding("renamed_run", 1, None, detail))
+        calibrations = self._calibrations()
+        if hasattr(estimator, "start"):
+            try:
+                estimator.start(self._context(attached, attachment, calibrations))
+            except AlgorithmError as error:
+                raise UsageError(f"{self.source.name}: estimator {maker.name}: {error}") from None
+        offline = [
+            r.run
+            for r in self.runs
+            if r.offline and any(c.topic.startswith(f"/estimate/{r.run}/") for c in attached)
+        ]
+        if offline and not getattr(estimator, "offline", False):
             raise UsageError(
-                f"{source.name}: no channel {topic}; there are "
-                f"{', '.join(t for t in source.channels if not t.startswith(NOT_RAW)) or 'none'}"
+                f"estimator {maker.name} is causal and cannot read {offline[0]}, whose results come at the end only"
             )
-    runs: list[PlannedRun] = []
-    for maker in makers:
-        for channels, notes in _attachments(maker.estimator.inputs, maker.name, source, inputs):
-            primary = channels[0]
-            assert primary is not None
-            rate = source.rate_hz(primary.topic)
-            estimator, values = maker.build(rate)
-            parts = "_".join(p for p in primary.topic.split("/") if p)
-            wanted = f"{_identifier(maker.label or maker.name)}_{_identifier(parts)}"
-            run = _free(wanted, {*taken, *(r.run for r in runs)})
-            if wanted in taken:
-                notes = (
-                    *notes,
-                    Finding(
-                        "renamed_run", 1, None, f"the recording has a run {wanted} already: this one is {run}"
-                    ),
+        planned = PlannedRun(
+            run,
+            estimator,
+            maker.name,
+            maker.version,
+            values,
+            attached,
+            rate,
+            _outputs(run, estimator, attachment, maker),
+            tuple(notes),
+            tuple(calibrations.values()),
+        )
+        self.runs.append(planned)
+        return planned
+
+    def _calibrations(self) -> dict[str, Calibration]:
+        """Return the usable calibrations by kind and by kind and subject; given ones before the recording's own."""
+        own = calibrations_of(getattr(self.source, "metadata", {}))
+        found: dict[str, Calibration] = {}
+        for one in (*self.given, *own):
+            if one.usable:
+                found.setdefault(f"{one.kind}:{one.subject}" if one.subject else one.kind, one)
+        return found
+
+    def _context(
+        self,
+        attached: Sequence[AttachedChannel],
+        attachment: Attachment,
+        calibrations: Mapping[str, Calibration],
+    ) -> Context:
+        infos: dict[str, list[ChannelInfo]] = {name: [] for name in attachment.channels}
+        for one in attached:
+            channel = attachment.channels[one.input][one.number]
+            infos[one.input].append(
+                ChannelInfo(
+                    one.topic, channel.schema, channel.frame_id, one.columns, one.rate_hz, channel.metadata
                 )
-            columns = tuple(
-                (None if c is None else c.topic, i.columns)
-                for c, i in zip(channels, estimator.inputs, strict=True)
             )
-            runs.append(
-                PlannedRun(
-                    run,
-                    estimator,
-                    maker.name,
-                    maker.version,
-                    values,
-                    columns,
-                    rate,
-                    _outputs(run, estimator, primary, maker),
-                    notes,
-                )
-            )
-    return tuple(runs)
+        by_kind = {c.kind: c for c in reversed(list(calibrations.values()))}
+        return Context(
+            {name: tuple(found) for name, found in infos.items()},
+            getattr(self.source, "metadata", {}),
+            getattr(self.source, "attachments", {}),
+            getattr(self.source, "static", {}),
+            {**by_kind, **calibrations},
+        )
+
+
+def _origin(channel: PlannedChannel) -> str:
+    """Return the raw topic that a channel goes back to: runs are called after it."""
+    return channel.metadata.get("input", channel.topic) if channel.run else channel.topic
 
 
 class _Maker:
@@ -303,88 +490,12 @@ class _Maker:
         return estimator, msgspec.to_builtins(params) if isinstance(params, msgspec.Struct) else {}
 
 
-def _attachments(
-    wanted: Sequence[Input], name: str, source: Source, chosen: Sequence[str] | None
-) -> list[tuple[tuple[PlannedChannel | None, ...], tuple[Finding, ...]]]:
-    """Return for every run of an estimator the channel of each input, and what to say about the choice."""
-    if not wanted:
-        raise UsageError(f"estimator {name} declares no inputs")
-    pool = [c for t, c in source.channels.items() if (t in chosen if chosen else not t.startswith(NOT_RAW))]
-    if chosen:  # the user's order decides which is which
-        pool.sort(key=lambda c: list(chosen).index(c.topic))
-    fitting = [c for c in pool if c.schema == wanted[0].schema]
-    if not fitting:
-        kinds = ", ".join(f"{c.topic} ({c.schema})" for c in pool) or "none"
-        raise UsageError(
-            f"{source.name}: estimator {name} needs a channel of {wanted[0].schema}; there are {kinds}"
-        )
-    alike = [i for i, w in enumerate(wanted) if w.schema == wanted[0].schema and not w.optional]
-    if len(alike) > 1:
-        if len(fitting) != len(alike):
-            topics = ", ".join(c.topic for c in fitting)
-            raise UsageError(
-                f"{source.name}: estimator {name} reads {len(alike)} channels of {wanted[0].schema} "
-                f"together, there are {len(fitting)} ({topics}); name them in order with --input"
-            )
-        groups = [dict(zip(alike, fitting, strict=True))]
-    else:
-        groups = [{0: c} for c in fitting]
-    result = []
-    for group in groups:
-        channels: list[PlannedChannel | None] = []
-        notes: list[Finding] = []
-        for i, need in enumerate(wanted):
-            channel = group.get(i)
-            if channel is None:
-                channel, note = _companion(need, group[0], source, chosen, name)
-                notes += note
-            if channel is not None and (lacking := [c for c in need.columns if c not in channel.columns]):
-                raise UsageError(
-                    f"{source.name}: {channel.topic} has no column {lacking[0]}, which {name} reads; "
-                    f"it has {', '.join(channel.columns)}"
-                )
-            channels.append(channel)
-        result.append((tuple(channels), tuple(notes)))
-    return result
-
-
-def _companion(
-    need: Input, primary: PlannedChannel, source: Source, chosen: Sequence[str] | None, name: str
-) -> tuple[PlannedChannel | None, list[Finding]]:
-    """Return the channel of a further input: the one named, or the only one of its kind beside the first."""
-    beside = primary.topic.rpartition("/")[0] + "/"
-    fitting = [c for c in source.channels.values() if c.schema == need.schema and c.topic != primary.topic]
-    named = [c for c in fitting if chosen and c.topic in chosen]
-    near = [c for c in fitting if c.topic.startswith(beside) and not c.topic.startswith(NOT_RAW)]
-    candidates = named or near
-    if len(candidates) == 1:
-        return candidates[0], []
-    topics = ", ".join(c.topic for c in candidates) or "none"
-    if not need.optional:
-        raise UsageError(
-            f"{source.name}: estimator {name} on {primary.topic} needs one channel of {need.schema} "
-            f"under {beside}; there are {topics}; name it with --input"
-        )
-    if not candidates:
-        return None, []
-    return None, [
-        Finding(
-            "ambiguous_input",
-            len(candidates),
-            None,
-            f"{primary.topic}: runs without {need.schema}, since {topics} fit; name one with --input",
-        )
-    ]
-
-
-def _outputs(
-    run: str, estimator: Estimator, primary: PlannedChannel, maker: _Maker
-) -> dict[str, PlannedChannel]:
+def _outputs(run: str, estimator: Any, attachment: Attachment, maker: _Maker) -> dict[str, PlannedChannel]:
     about = {
         "run": run,
         "estimator": maker.name,
         "version": maker.version,
-        "input": primary.topic,
+        "input": _origin(attachment.primary),
         "latency": str(getattr(estimator, "latency", 0)),
         "offline": "true" if getattr(estimator, "offline", False) else "false",
     }
@@ -392,11 +503,11 @@ def _outputs(
     for output in estimator.outputs:
         if output.name in outputs:
             raise UsageError(f"estimator {maker.name} declares output {output.name} twice")
-        frame = primary.frame_id if output.name in ("detector", "stance") else "nav"
+        attached = attachment.channels.get(output.frame, ())
         outputs[output.name] = PlannedChannel(
             f"/estimate/{run}/{output.name}",
             output.schema,
-            frame,
+            attached[0].frame_id if attached else output.frame,
             _table_columns(output),
             about | dict(output.metadata),
             run,

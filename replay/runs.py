@@ -1,74 +1,73 @@
-"""One run: an estimator that takes rows and gives tables."""
+"""One run: an estimator that is given messages or rows and gives tables."""
 
 from __future__ import annotations
 
 import copy
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
 from ..algorithms.contract import (
     FloatArray,
+    IntArray,
+    KernelEstimator,
+    Output,
+    Result,
     RowKernel,
     input_columns,
     output_columns,
 )
 from ..recording.errors import Finding, MarchaError
-from .blocks import (
-    Block,
-    Columns,
-    by_columns,
-    joined,
-)
-from .feed import Feed, IntArray, Rows
+from ..recording.schemas import SCHEMAS
+from .blocks import Block, Columns, by_columns, joined_by_name
+from .marking import NO_ANNOTATIONS, Marker
+from .merging import AFTER_ALL
+from .messages import MessageBlock, MessageFeed
 from .plan import PlannedRun
+from .rows import RowBlock, RowFeed
+
+_INTEGERS = {"index": np.uint32, "status": np.int8, "service": np.uint16}
+_MESSAGES_A_CALL = 8192
+"""Messages that a kernel takes at once: what it reads and writes stays in the processor's cache."""
 
 
 @dataclass
 class _State:
     """What a run remembers between two parts, beside the estimator's own state."""
 
-    recent_ns: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     last_log_ns: int = 0
     samples: int = 0
-    still_since: int | None = None
-    still_until: int = 0
-    stances: int = 0
-    steps: int = 0
+    recent_ns: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
 
 
 class Runner:
-    """Drives one estimator and names the time of each of its results.
+    """Drives one estimator and names the time of each of its results; subclasses say how it is fed.
 
     Parameters
     ----------
     plan : PlannedRun
         The estimator, its channels and parameters.
-    feed : Feed
-        Where its rows come from.
+    feed : RowFeed or MessageFeed
+        Where its rows or messages come from.
     blocks : bool
-        Hand over whole blocks to estimators that take them (``run_block``), else one step a sample.
+        Hand over whole blocks to estimators that take them, else one step a sample.
     """
 
-    def __init__(self, plan: PlannedRun, feed: Feed, blocks: bool) -> None:
+    def __init__(self, plan: PlannedRun, feed: Any, blocks: bool) -> None:
         self.plan = plan
         self.feed = feed
         self.estimator: Any = plan.estimator
-        self.columns = output_columns(plan.estimator)
-        self.latency = plan.latency
-        self.blocks = blocks and not plan.offline and hasattr(self.estimator, "run_block")
+        self.blocks = blocks
         self.loop_s = 0.0
-        self._stances: list[IntArray] = []  # from, to
-        self._steps: list[Columns] = []
+        self.markers = {o.name: Marker(plan.run, o) for o in plan.estimator.outputs if o.annotate is not None}
         self._state = _State()
-        warm_up(self.estimator, self.blocks)
+        warm_up(self.estimator, blocks)
         self._fresh = self._estimator_snapshot()
-        self._rows: list[tuple[FloatArray, IntArray]] = []  # of an offline estimator, the present segment
 
     # -- state ---------------------------------------------------------------------------------------
 
@@ -86,54 +85,143 @@ class Runner:
 
     def snapshot(self) -> Any:
         """Return a copy of everything that later results depend on."""
-        return (
-            self._estimator_snapshot(),
-            copy.copy(self._state),
-            len(self._stances),
-            len(self._steps),
-            list(self._rows),
-        )
+        marks = {name: m.snapshot() for name, m in self.markers.items()}
+        return self._estimator_snapshot(), copy.copy(self._state), marks
 
     def restore(self, snapshot: Any) -> None:
         """Go back to ``snapshot``."""
-        estimator, state, stances, steps, rows = snapshot
+        estimator, state, marks = snapshot
         self._restore_estimator(estimator)
         self._state = copy.copy(state)
-        del self._stances[stances:], self._steps[steps:]
-        self._rows = list(rows)
+        for name, mark in marks.items():
+            self.markers[name].restore(mark)
 
-    # -- rows in, blocks out -------------------------------------------------------------------------
+    # -- use -----------------------------------------------------------------------------------------
 
-    def take(self, rows: Rows) -> dict[str, Block]:
-        """Feed rows; return a block of every output that has something to say."""
-        blocks: list[dict[str, Block]] = []
-        bounds = [0, *rows.resets, len(rows)]
-        for k, (a, b) in enumerate(pairwise(bounds)):
-            if k and self._state.samples:
-                blocks.append(self._restart())
-            if b > a:
-                blocks.append(self._segment(rows.values[a:b], rows.t_ns[a:b], rows.t_log_ns[a:b]))
-        if len(blocks) == 1:
-            return blocks[0]
-        names = dict.fromkeys(n for given in blocks for n in given)
-        return {n: joined([given[n] for given in blocks if n in given]) for n in names}
+    def take(self, given: Any) -> dict[str, Block]:
+        """Feed what the feed gave; return a block of every output that has something to say."""
+        raise NotImplementedError
+
+    def _held_back(self, key: int) -> dict[str, Block]:
+        """Return the results that the estimator still holds, known at the newest message."""
+        raise NotImplementedError
 
     def finish(self, end_ns: int) -> dict[str, Block]:
         """Return the results that the estimator still holds; ``end_ns`` is the log time of an offline one."""
         if self.plan.offline:
             self._state.last_log_ns = max(self._state.last_log_ns, end_ns)
-        blocks = self._flush()
-        self._close_stance()
+        blocks = self._held_back(AFTER_ALL)
+        self._close_marks()
         return blocks
 
-    def _restart(self) -> dict[str, Block]:
-        blocks = self._flush()
-        self._close_stance()
+    def _restart(self, key: int) -> dict[str, Block]:
+        blocks = self._held_back(key)
+        self._close_marks()
         self._restore_estimator(self._fresh)
         self._state.recent_ns = np.empty(0, np.int64)
         return blocks
 
-    def _segment(self, values: FloatArray, t_ns: IntArray, t_log_ns: IntArray) -> dict[str, Block]:
+    def annotations(self) -> pl.DataFrame:
+        """Return what the outputs declare as annotations, by start."""
+        tables = [NO_ANNOTATIONS, *(m.table() for m in self.markers.values())]
+        return pl.concat(tables).sort("start_ns", maintain_order=True)
+
+    def _close_marks(self) -> None:
+        for marker in self.markers.values():
+            marker.close()
+
+    def _block(self, output: Output, rows: Columns, keys: IntArray) -> Block:
+        """Give the columns of an output their types and note its annotations."""
+        data = {
+            name: values if name in _TIMES else _typed(output, name, values) for name, values in rows.items()
+        }
+        if output.schema == "marcha_msgs/msg/Step":
+            data = _with_swing_times(data)
+        if output.name in self.markers:
+            self.markers[output.name].take(data)
+        return Block(data, keys)
+
+    def _by_output(
+        self, columns: FloatArray, t_ns: IntArray, t_log_ns: IntArray, keys: IntArray
+    ) -> dict[str, Block]:
+        """Return a block an output; ``columns`` is (columns, rows), all outputs one after another."""
+        blocks: dict[str, Block] = {}
+        first = 0
+        for output in self.estimator.outputs:
+            part = columns[first : first + len(output.columns)]
+            first += len(output.columns)
+            spoken = ~np.isnan(part[0])
+            if not output.event and not spoken.all():
+                spoken = ~np.isnan(part).all(axis=0)
+            if not spoken.any():
+                continue
+            pick = slice(None) if spoken.all() else spoken
+            data: Columns = {"t_ns": t_ns[pick], "t_log_ns": t_log_ns[pick]}
+            data |= {name: part[i][pick] for i, name in enumerate(output.columns)}
+            blocks[output.name] = self._block(output, data, keys[pick])
+        return blocks
+
+    # -- what to say -----------------------------------------------------------------------------------
+
+    @property
+    def samples(self) -> int:
+        """Rows or messages that the estimator was fed."""
+        return self._state.samples
+
+    def findings(self) -> tuple[list[Finding], bool]:
+        """Return what the user must know about the run, and whether its results must not be used."""
+        found = [*self.plan.findings, *self.feed.findings()]
+        fatal = False
+        if not self.samples:
+            columns = " ".join(self.plan.inputs[0].columns)
+            detail = (
+                f"{self.plan.input}: no message with a finite value in each of {columns} in the time "
+                "that was played: nothing was computed"
+            )
+            found.append(Finding("no_samples", 1, None, detail))
+            fatal = True
+        for remark in self.estimator.remarks() if hasattr(self.estimator, "remarks") else ():
+            found.append(Finding(remark.kind, 1, None, remark.detail))
+            fatal |= remark.fatal
+        return found, fatal
+
+
+class RowRunner(Runner):
+    """Feeds rows."""
+
+    feed: RowFeed
+
+    def __init__(self, plan: PlannedRun, feed: RowFeed, blocks: bool) -> None:
+        self.columns = output_columns(plan.estimator)
+        self.latency = plan.latency
+        self._rows: list[tuple[FloatArray, IntArray]] = []  # of an offline estimator, the present segment
+        super().__init__(plan, feed, blocks and not plan.offline and hasattr(plan.estimator, "run_block"))
+
+    def snapshot(self) -> Any:
+        """Return a copy of everything that later results depend on."""
+        return super().snapshot(), list(self._rows)
+
+    def restore(self, snapshot: Any) -> None:
+        """Go back to ``snapshot``."""
+        super().restore(snapshot[0])
+        self._rows = list(snapshot[1])
+
+    def take(self, given: RowBlock) -> dict[str, Block]:
+        """Feed rows; return a block of every output that has something to say."""
+        blocks: list[dict[str, Block]] = []
+        bounds = [0, *given.resets, len(given)]
+        for k, (a, b) in enumerate(pairwise(bounds)):
+            if k and self._state.samples:
+                blocks.append(self._restart(int(given.keys[a])))
+            if b > a:
+                blocks.append(
+                    self._segment(given.values[a:b], given.t_ns[a:b], given.t_log_ns[a:b], given.keys[a:b])
+                )
+        return joined_by_name(blocks)
+
+    def _segment(
+        self, values: FloatArray, t_ns: IntArray, t_log_ns: IntArray, keys: IntArray
+    ) -> dict[str, Block]:
         state = self._state
         state.samples += len(t_ns)
         state.last_log_ns = int(t_log_ns[-1])
@@ -152,10 +240,10 @@ class Runner:
                         f"estimator {self.plan.name} gave a result within its first {self.latency} rows, "
                         f"its declared latency: the result would have no time"
                     )
-                columns, t_log_ns = columns[:, early:], t_log_ns[early:]
+                columns, t_log_ns, keys = columns[:, early:], t_log_ns[early:], keys[early:]
             times = known[: len(known) - self.latency] if len(known) > self.latency else known[:0]
             times = times[len(times) - columns.shape[1] :]
-        return self._by_output(columns, times, t_log_ns)
+        return self._by_output(columns, times, t_log_ns, keys)
 
     def _results(self, rows: FloatArray) -> FloatArray:
         """Return the result of every row, NaN where there is none."""
@@ -173,7 +261,7 @@ class Runner:
         self.loop_s += time.perf_counter() - begin
         return out
 
-    def _flush(self) -> dict[str, Block]:
+    def _held_back(self, key: int) -> dict[str, Block]:
         state = self._state
         if self.plan.offline:
             if not self._rows:
@@ -194,102 +282,178 @@ class Runner:
                 f"estimator {self.plan.name} returned {out.shape} at its end, "
                 f"expected ({len(times)}, {len(self.columns)})"
             )
-        return self._by_output(np.ascontiguousarray(out.T), times, np.full(len(times), state.last_log_ns))
-
-    def _by_output(self, columns: FloatArray, t_ns: IntArray, t_log_ns: IntArray) -> dict[str, Block]:
-        """Return a block an output; ``columns`` is (columns, rows)."""
-        blocks: dict[str, Block] = {}
-        first = 0
-        for output in self.estimator.outputs:
-            part = columns[first : first + len(output.columns)]
-            first += len(output.columns)
-            spoken = ~np.isnan(part[0])
-            if not output.event and not spoken.all():
-                spoken = ~np.isnan(part).all(axis=0)
-            if not spoken.any():
-                continue
-            pick = slice(None) if spoken.all() else spoken
-            data: Columns = {"t_ns": t_ns[pick], "t_log_ns": t_log_ns[pick]}
-            data |= {name: part[i][pick] for i, name in enumerate(output.columns)}
-            if output.schema == "marcha_msgs/msg/Stance":
-                data["still"] = data["still"] > 0.5
-                self._note_stances(data["t_ns"], data["still"])
-            if output.schema == "marcha_msgs/msg/Step":
-                data = _with_swing_times(data)
-                self._steps.append(data)
-            blocks[output.name] = Block(data)
-        return blocks
-
-    # -- annotations ---------------------------------------------------------------------------------
-
-    def _note_stances(self, t_ns: IntArray, still: NDArray[np.bool_]) -> None:
-        """Join still samples to intervals: first to last still sample."""
-        state = self._state
-        edges = np.flatnonzero(np.diff(still, prepend=state.still_since is not None))
-        begins, after = edges[still[edges]], edges[~still[edges]]
-        since, until = t_ns[begins], t_ns[after - 1]
-        if state.still_since is not None:
-            since = np.append(np.int64(state.still_since), since)
-        if len(after) and after[0] == 0:
-            until[0] = state.still_until
-        self._stances.append(np.column_stack((since[: len(until)], until)))
-        state.still_since = int(since[-1]) if len(since) > len(until) else None
-        state.still_until = int(t_ns[-1])
-
-    def _close_stance(self) -> None:
-        state = self._state
-        if state.still_since is not None:
-            self._stances.append(np.array([[state.still_since, state.still_until]]))
-            state.still_since = None
-
-    def annotation_table(self) -> pl.DataFrame:
-        """Return stances and steps as annotations of the tiers ``<run>/stance`` and ``<run>/step``."""
-        run = self.plan.run
-        bounds = np.concatenate([np.empty((0, 2), np.int64), *self._stances])
-        stances = pl.DataFrame({"start_ns": bounds[:, 0], "end_ns": bounds[:, 1]}).select(
-            pl.lit(f"{run}/stance").alias("tier"),
-            "start_ns",
-            "end_ns",
-            pl.lit("stance").alias("label"),
-            pl.lit("{}").alias("metadata"),
+        n = len(times)
+        return self._by_output(
+            np.ascontiguousarray(out.T), times, np.full(n, state.last_log_ns), np.full(n, key)
         )
-        tables = [stances]
-        if self._steps:
-            steps = {name: np.concatenate([s[name] for s in self._steps]) for name in self._steps[0]}
-            tables.append(_step_annotations(pl.DataFrame(steps), run))
-        return pl.concat(tables).sort("start_ns", maintain_order=True)
 
-    # -- what to say -----------------------------------------------------------------------------------
 
-    @property
-    def samples(self) -> int:
-        """Rows that the estimator was fed."""
-        return self._state.samples
+class MessageRunner(Runner):
+    """Feeds every message of every input."""
 
-    def findings(self) -> tuple[list[Finding], bool]:
-        """Return what the user must know about the run, and whether its results must not be used."""
-        found = [*self.plan.findings, *self.feed.findings()]
-        fatal = False
-        if not self.samples:
-            columns = " ".join(self.plan.inputs[0][1])
-            found.append(
-                Finding(
-                    "no_samples",
-                    1,
-                    None,
-                    f"{self.plan.input}: no message with a finite value in each of {columns} in the time "
-                    "that was played: nothing was computed",
+    feed: MessageFeed
+
+    def __init__(self, plan: PlannedRun, feed: MessageFeed, blocks: bool) -> None:
+        self.outputs = {o.name: o for o in plan.estimator.outputs}
+        self.kernel = isinstance(plan.estimator, KernelEstimator)
+        super().__init__(plan, feed, blocks and self.kernel)
+
+    def take(self, given: MessageBlock) -> dict[str, Block]:
+        """Feed messages; return a block of every output that has something to say."""
+        blocks: list[dict[str, Block]] = []
+        messages = None if self.kernel else list(given.messages())
+        values = self._encoded(given) if self.kernel else None
+        for k, (a, b) in enumerate(pairwise([0, *given.resets, len(given)])):
+            if k and self._state.samples:
+                blocks.append(self._restart(int(given.keys[min(a, len(given) - 1)])))
+            if b == a:
+                continue
+            self._state.samples += b - a
+            self._state.last_log_ns = int(given.t_log_ns[b - 1])
+            if messages is not None:
+                blocks.append(self._one_by_one(messages[a:b], given.keys[a:b]))
+            else:
+                assert values is not None
+                blocks.append(self._through_kernel(given, values, a, b))
+        return joined_by_name(blocks)
+
+    def _encoded(self, given: MessageBlock) -> FloatArray:
+        """Return the values of all messages as the kernel takes them."""
+        encoded = [
+            (p.places, self.estimator.encode(p.channel.index, p.channel.number, p.table))
+            for p in given.pieces
+        ]
+        width = max((len(c.columns) for c in self.feed.channels), default=0)
+        values = np.full((len(given), max(1, width, *(e.shape[1] for _, e in encoded))), np.nan)
+        for places, numbers in encoded:
+            values[places, : numbers.shape[1]] = numbers
+        return values
+
+    def _through_kernel(
+        self, given: MessageBlock, values: FloatArray, first: int, last: int
+    ) -> dict[str, Block]:
+        estimator: KernelEstimator = self.estimator
+        step = _MESSAGES_A_CALL if self.blocks else 1
+        whose: list[IntArray] = []
+        times: list[IntArray] = []
+        rows: list[FloatArray] = []
+        for a in range(first, last, step):
+            b = min(a + step, last)
+            room = (b - a) * estimator.max_results
+            message, t_ns = np.empty(room, np.int64), np.empty(room, np.int64)
+            out = np.empty((room, estimator.width))
+            begin = time.perf_counter()
+            n = int(
+                estimator.run(
+                    estimator.state,
+                    given.inputs[a:b],
+                    given.channels[a:b],
+                    given.t_ns[a:b],
+                    values[a:b],
+                    message,
+                    t_ns,
+                    out,
                 )
             )
-            fatal = True
-        for remark in self.estimator.remarks() if hasattr(self.estimator, "remarks") else ():
-            found.append(Finding(remark.kind, 1, None, remark.detail))
-            fatal |= remark.fatal
-        return found, fatal
+            self.loop_s += time.perf_counter() - begin
+            if n:
+                whose.append(message[:n] + a)
+                times.append(t_ns[:n])
+                rows.append(out[:n])
+        if not whose:
+            return {}
+        cause = np.concatenate(whose)
+        columns = np.ascontiguousarray(np.concatenate(rows).T)
+        return self._by_output(columns, np.concatenate(times), given.t_log_ns[cause], given.keys[cause])
+
+    def _one_by_one(self, messages: Sequence[Any], keys: IntArray) -> dict[str, Block]:
+        found: list[tuple[int, Result]] = []
+        take = self.estimator.take
+        begin = time.perf_counter()
+        for i, message in enumerate(messages):
+            results = take(message)
+            if results:
+                if type(results) is Result:
+                    found.append((i, results))
+                else:
+                    found += [(i, r) for r in results]
+        self.loop_s += time.perf_counter() - begin
+        logs = np.array([m.log_ns for m in messages], np.int64)
+        return self._blocks_of(found, logs, keys)
+
+    def _held_back(self, key: int) -> dict[str, Block]:
+        state = self._state
+        if not hasattr(self.estimator, "finish"):
+            return {}
+        begin = time.perf_counter()
+        if self.kernel:
+            t_ns, values = self.estimator.held()
+            self.loop_s += time.perf_counter() - begin
+            n = len(t_ns)
+            columns = np.ascontiguousarray(values.T)
+            return self._by_output(columns, t_ns, np.full(n, state.last_log_ns), np.full(n, key)) if n else {}
+        found = [(0, r) for r in self.estimator.finish() or ()]
+        self.loop_s += time.perf_counter() - begin
+        return self._blocks_of(found, np.array([state.last_log_ns]), np.array([key]))
+
+    def _blocks_of(self, found: list[tuple[int, Result]], logs: IntArray, keys: IntArray) -> dict[str, Block]:
+        """Return single results as one block an output."""
+        if not found:
+            return {}
+        by_name: dict[str, tuple[list[int], list[int], list[Sequence[Any]]]] = {}
+        for i, (name, t_ns, values) in found:
+            if name not in by_name:
+                by_name[name] = ([], [], [])
+            whose, times, rows = by_name[name]
+            whose.append(i)
+            times.append(t_ns)
+            rows.append(values)
+        blocks: dict[str, Block] = {}
+        for name, (whose, times, rows) in by_name.items():
+            output = self.outputs.get(name)
+            if output is None:
+                raise MarchaError(
+                    f"estimator {self.plan.name} gave a result for {name!r}; it declares {', '.join(self.outputs)}"
+                )
+            if any(len(r) != len(output.columns) for r in rows):
+                bad = next(r for r in rows if len(r) != len(output.columns))
+                raise MarchaError(
+                    f"estimator {self.plan.name}: a result of {name!r} has {len(bad)} values, "
+                    f"its output has {len(output.columns)} columns: {', '.join(output.columns)}"
+                )
+            data: Columns = {"t_ns": np.array(times, np.int64), "t_log_ns": logs[whose]}
+            for column, values in zip(output.columns, zip(*rows, strict=True), strict=True):
+                data[column] = np.array(values)
+            blocks[name] = self._block(output, data, keys[whose])
+        return blocks
+
+
+_TIMES = ("t_ns", "t_log_ns")
+
+
+def _typed(output: Output, name: str, values: Any) -> Any:
+    """Return a result column in the type of its message's field."""
+    schema = SCHEMAS.get(output.schema)
+    column = (
+        None if schema is None or schema.names else next((c for c in schema.columns if c.name == name), None)
+    )
+    if column is None:
+        return values.astype(np.float64) if values.dtype.kind in "iufb" else values
+    if column.kind == "flag":
+        return values > 0.5 if values.dtype.kind == "f" else values.astype(bool)
+    if column.kind == "time":
+        return values.astype(np.int64)
+    if column.kind in ("mac", "technology", "text"):
+        return values.astype(object) if values.dtype.kind == "U" else values
+    return values.astype(_INTEGERS.get(name, np.float64), copy=False)
 
 
 def warm_up(estimator: Any, blocks: bool) -> None:
     """Let a kernel compile (or load from its cache) before a clock runs; its state stays as it is."""
+    if isinstance(estimator, KernelEstimator):
+        none, width = np.empty(0, np.int64), max(len(i.columns) for i in estimator.inputs)
+        values, out = np.empty((0, max(1, width))), np.empty((0, estimator.width))
+        estimator.run(estimator.state, none, none, none, values, none.copy(), none.copy(), out)
     if not isinstance(estimator, RowKernel):
         return
     before = estimator.snapshot()
@@ -305,32 +469,19 @@ def warm_up(estimator: Any, blocks: bool) -> None:
     estimator.restore(before)
 
 
-def _step_annotations(steps: pl.DataFrame, run: str) -> pl.DataFrame:
-    """Return steps as annotations; their numbers, rounded to six digits, are the metadata (JSON text)."""
-    about = sorted(c for c in steps.columns if c not in ("t_ns", "t_log_ns", "start_ns", "end_ns"))
-    texts = [pl.Series(c, [f"{v:.6g}" for v in steps[c].to_list()], dtype=pl.String) for c in about]
-    form = "{{" + ", ".join(f'"{c}": "{{}}"' for c in about) + "}}"
-    number = pl.col("index") if "index" in about else pl.int_range(pl.len())
-    return steps.select(
-        pl.lit(f"{run}/step").alias("tier"),
-        "start_ns",
-        "end_ns",
-        pl.format("step {}", number).alias("label"),
-        pl.format(form, *texts).alias("metadata"),
-    )
-
-
 def _with_swing_times(steps: Columns) -> Columns:
-    """Turn the swing's length of a step, which ends at the row's time, into its two times."""
+    """Turn the swing's length of a step, which ends at the row's time, into its two times.
+
+    Row kernels know no clock: they state ``swing_s`` instead of ``start_ns`` and ``end_ns``.
+    """
     if "swing_s" not in steps:
         return steps
     t_ns = steps["t_ns"]
     times = {"start_ns": t_ns - np.round(steps["swing_s"] * 1e9).astype(np.int64), "end_ns": t_ns}
     rest = {name: values for name, values in steps.items() if name not in ("t_ns", "t_log_ns", "swing_s")}
-    return {
-        "t_ns": t_ns,
-        "t_log_ns": steps["t_log_ns"],
-        **times,
-        **rest,
-        "index": rest["index"].astype(np.uint32),
-    }
+    return {"t_ns": t_ns, "t_log_ns": steps["t_log_ns"], **times, **rest}
+
+
+def runner_of(plan: PlannedRun, feed: RowFeed | MessageFeed, blocks: bool) -> Runner:
+    """Return the runner that fits the feed."""
+    return RowRunner(plan, feed, blocks) if isinstance(feed, RowFeed) else MessageRunner(plan, feed, blocks)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import polars as pl
 
@@ -21,35 +21,46 @@ LEVEL = None
 twice as long as all the rest of writing them. A recording that is exported to be handed on is compressed."""
 
 
-class Sink(Protocol):
-    """What takes part in a replay as an observer: a viewer, a file, a test.
+class Sink:
+    """What takes part in a replay as an observer: a viewer, a file, a test. Subclass it.
 
-    A sink may set ``raw = False`` if it does not want the source's own channels, and may have a method
-    ``rewind(t_log_ns)``: it is called when the engine seeks back, and what was logged from that time on comes
-    again. A sink without it sees every message once, whatever the engine does. One with a method
-    ``write_block(topic, block)`` is given a :class:`.blocks.Block` instead of a table.
+    Attributes
+    ----------
+    raw : bool
+        Whether it wants the source's own channels too.
+    rewinds : bool
+        Whether :meth:`rewind` takes back what was given: when the engine seeks back, it comes again. A sink that
+        does not is given every message once, whatever the engine does.
     """
+
+    raw: bool = True
+    rewinds: bool = False
 
     def open(self, plan: Plan) -> None:
         """Prepare for the channels of ``plan``. Where this or a later sink's fails, all are closed."""
-        ...
 
     def write(self, topic: str, table: pl.DataFrame) -> None:
         """Take messages of one topic: ``t_ns``, ``t_log_ns`` and columns, in log-time order per topic."""
-        ...
+
+    def write_block(self, topic: str, block: Block) -> None:
+        """Take the same as a block; a sink that wants arrays overrides this instead of :meth:`write`."""
+        self.write(topic, block.table)
+
+    def rewind(self, t_log_ns: int) -> None:
+        """Forget what was logged from ``t_log_ns`` on."""
 
     def close(self, result: ReplayResult | None) -> None:
         """Finish; ``result`` is None where the replay failed and nothing may remain."""
-        ...
 
 
-class TableSink:
+class TableSink(Sink):
     """Keeps the tables of all runs in memory.
 
     :meth:`table` returns one.
     """
 
     raw = False
+    rewinds = True
 
     def __init__(self) -> None:
         self._pieces: dict[str, list[pl.DataFrame]] = {}
@@ -69,9 +80,6 @@ class TableSink:
         for topic, pieces in self._pieces.items():
             self._pieces[topic] = [p.filter(pl.col("t_log_ns") < t_log_ns) for p in pieces]
 
-    def close(self, result: ReplayResult | None) -> None:
-        """Nothing to do."""
-
     def table(self, topic: str) -> pl.DataFrame | None:
         """Return all messages of a topic, None where it is not one of a run's."""
         if pieces := self._pieces.get(topic):
@@ -86,7 +94,7 @@ class TableSink:
         )
 
 
-class RecordingSink:
+class RecordingSink(Sink):
     """Writes a recording; the file itself is written in the background.
 
     Parameters

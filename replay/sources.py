@@ -11,6 +11,7 @@ import queue
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -74,6 +75,9 @@ class Source(Protocol):
     seekable: bool
     start_ns: int
     end_ns: int
+    metadata: Mapping[str, Mapping[str, str]]
+    attachments: Mapping[str, bytes]
+    static: Mapping[str, pl.DataFrame]
 
     def rate_hz(self, topic: str) -> float:
         """Return the channel's measured or declared rate in hertz, 0 where it is not known."""
@@ -111,6 +115,25 @@ class SourceFailed(MarchaError):
     """A live source broke off. What it delivered before is recorded all the same."""
 
 
+class _Attachments(Mapping[str, bytes]):
+    """Attachments of a recording, read when asked for."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._names = [a.name for a in recording.attachments]
+
+    def __getitem__(self, name: str) -> bytes:
+        if name not in self._names:
+            raise KeyError(name)
+        return self._recording.attachment(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+
 class RecordingSource:
     """Messages of a recording, or of a part of its topics.
 
@@ -135,7 +158,14 @@ class RecordingSource:
         }
         self.start_ns = recording.start_ns
         self.end_ns = recording.end_ns
+        self.metadata = recording.metadata
+        self.attachments = _Attachments(recording)
         self._rates: dict[str, float] = {}
+
+    @cached_property
+    def static(self) -> dict[str, pl.DataFrame]:
+        """Static frames by topic."""
+        return {t: self.recording.table(t) for t in self.channels if t.endswith("_static")}
 
     def rate_hz(self, topic: str) -> float:
         """Return the rate of the channel's first samples in hertz."""
@@ -173,11 +203,13 @@ class LiveSource:
         What will come. A channel's metadata may say ``rate_hz``.
     messages : iterable of (topic, t_ns, values), optional
         Read in a thread of its own until it ends. Without it, call :meth:`put` and :meth:`close`.
-        ``values`` are numbers in the order of the channel's columns.
+        ``values`` are numbers, texts or booleans in the order of the channel's columns.
     name : str
         What the lineage says about the input.
     capacity : int
         Messages that may wait; whoever puts more waits until the engine has caught up.
+    metadata, attachments : mapping, optional
+        What estimators are told before the first message, as a recording would.
 
     Notes
     -----
@@ -191,15 +223,20 @@ class LiveSource:
     def __init__(
         self,
         channels: Sequence[PlannedChannel],
-        messages: Iterable[tuple[str, int, Sequence[float]]] | None = None,
+        messages: Iterable[tuple[str, int, Sequence[Any]]] | None = None,
         name: str = "live",
         capacity: int = 65_536,
+        metadata: Mapping[str, Mapping[str, str]] | None = None,
+        attachments: Mapping[str, bytes] | None = None,
     ) -> None:
         self.name = name
+        self.metadata: Mapping[str, Mapping[str, str]] = metadata or {}
+        self.attachments: Mapping[str, bytes] = attachments or {}
+        self.static: Mapping[str, pl.DataFrame] = {}
         self.channels = {c.topic: c for c in channels}
         self.start_ns = 0
         self.end_ns = 0
-        self._queue: queue.Queue[tuple[str, int, Sequence[float]] | BaseException | None] = queue.Queue(
+        self._queue: queue.Queue[tuple[str, int, Sequence[Any]] | BaseException | None] = queue.Queue(
             capacity
         )
         self._closed = False
@@ -207,7 +244,7 @@ class LiveSource:
         if messages is not None:
             threading.Thread(target=self._pump, args=(messages,), daemon=True, name="live source").start()
 
-    def _pump(self, messages: Iterable[tuple[str, int, Sequence[float]]]) -> None:
+    def _pump(self, messages: Iterable[tuple[str, int, Sequence[Any]]]) -> None:
         try:
             for topic, t_ns, values in messages:
                 self.put(topic, t_ns, values)
@@ -216,7 +253,7 @@ class LiveSource:
         else:
             self._queue.put(None)
 
-    def put(self, topic: str, t_ns: int, values: Sequence[float]) -> None:
+    def put(self, topic: str, t_ns: int, values: Sequence[Any]) -> None:
         """Hand over one message; may be called from any one thread.
 
         Raises
@@ -250,7 +287,7 @@ class LiveSource:
         """Yield whatever has arrived, as soon as something has; each message comes once."""
         wanted, latest = set(topics), -(2**63)
         while not self._closed:
-            rows: dict[str, list[tuple[int, int, Sequence[float]]]] = {
+            rows: dict[str, list[tuple[int, int, Sequence[Any]]]] = {
                 t: [] for t in self.channels if t in wanted
             }
             for message in self._arrived():
@@ -265,9 +302,9 @@ class LiveSource:
         if self._failure is not None:
             raise SourceFailed(f"live source {self.name} failed: {self._failure}") from self._failure
 
-    def _arrived(self) -> list[tuple[str, int, Sequence[float]]]:
+    def _arrived(self) -> list[tuple[str, int, Sequence[Any]]]:
         """Wait for one message, then take all that are there."""
-        messages: list[tuple[str, int, Sequence[float]]] = []
+        messages: list[tuple[str, int, Sequence[Any]]] = []
         item = self._queue.get()
         while True:
             if item is None:
@@ -283,12 +320,13 @@ class LiveSource:
             except queue.Empty:
                 return messages
 
-    def _table(self, topic: str, rows: list[tuple[int, int, Sequence[float]]]) -> pl.DataFrame:
-        values = np.array([r[2] for r in rows], dtype=np.float64).reshape(len(rows), -1)
+    def _table(self, topic: str, rows: list[tuple[int, int, Sequence[Any]]]) -> pl.DataFrame:
         data: dict[str, Any] = {
             "t_ns": np.array([r[0] for r in rows], dtype=np.int64),
             "t_log_ns": np.array([r[1] for r in rows], dtype=np.int64),
         }
-        return pl.DataFrame(
-            data | {c: values[:, i].copy() for i, c in enumerate(self.channels[topic].columns)}
-        )
+        columns = zip(*(r[2] for r in rows), strict=True)
+        for name, values in zip(self.channels[topic].columns, columns, strict=True):
+            numbers = isinstance(values[0], int | float) and not isinstance(values[0], bool)
+            data[name] = np.array(values, dtype=np.float64) if numbers else list(values)
+        return pl.DataFrame(data)

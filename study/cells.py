@@ -23,8 +23,9 @@ from ..recording import MarchaError, OutputExists, Recording
 from ..recording import create as create_recording
 from ..recording import open as open_recording
 from ..replay.api import replay
+from ..replay.attachment import NOT_RAW
 from ..replay.engine import Run
-from ..replay.plan import NOT_RAW, EstimatorSpec
+from ..replay.plan import EstimatorSpec
 from ..replay.runs import warm_up
 from .plan import Job, Source, Task
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from marcha.algorithms import Input, Output, PlainEstimator
+from marcha.algorithms import Input, Output, RowEstimator
 from marcha.replay import Batch, Engine, PlannedChannel, ReplayResult, TableSink, plan_runs
 
 IMU = "sensor_msgs/msg/Imu"
@@ -40,6 +40,9 @@ class MemorySource:
 
     seekable = True
     name = "memory"
+    metadata: Mapping[str, Mapping[str, str]] = {}
+    attachments: Mapping[str, bytes] = {}
+    static: Mapping[str, pl.DataFrame] = {}
 
     def __init__(self, pairs: Sequence[tuple[PlannedChannel, pl.DataFrame]], max_rows: int = 1000) -> None:
         self.channels = {c.topic: c for c, _ in pairs}
@@ -74,7 +77,7 @@ class MemorySource:
                 yield Batch(b, part)
 
 
-class Echo(PlainEstimator):
+class Echo(RowEstimator):
     """Says exactly what it was fed."""
 
     name = "echo"
@@ -89,7 +92,7 @@ class Echo(PlainEstimator):
         return row.copy()
 
 
-class Smoother(PlainEstimator):
+class Smoother(RowEstimator):
     """Recursive: its bits depend on every row and their order. Late by ``latency`` rows; takes blocks too."""
 
     name = "smoother"

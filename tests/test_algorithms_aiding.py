@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from . import algorithms_reference as ref
 from .algorithms_support import columns, run, simulated
-from .contracts.estimator import EstimatorContract
+from .contracts.estimator import RowEstimatorContract
 
 AIDED = ("foot.9iez", "foot.15iez-zaru")
 FIELD_N = np.array([22e-6, 5e-6, -40e-6])
@@ -95,7 +95,7 @@ def same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
 # ---------------------------------------------------------------------------------------------
 
 
-class AidedContract(EstimatorContract):
+class AidedContract(RowEstimatorContract):
     params = ALL | {"init_s": 0.5}
 
     def rows(self) -> np.ndarray:

@@ -17,12 +17,12 @@ from marcha.algorithms import make
 from numba.core.dispatcher import Dispatcher
 
 from .algorithms_support import FOOT, simulated
-from .contracts.estimator import EstimatorContract
+from .contracts.estimator import RowEstimatorContract
 
 QUICK: dict[str, Any] = {"init_s": 0.5}
 
 
-class FootContract(EstimatorContract):
+class FootContract(RowEstimatorContract):
     params = QUICK
 
     def rows(self) -> np.ndarray:

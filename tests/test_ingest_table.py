@@ -315,7 +315,7 @@ TIME = '[time]\ncolumn = "t"\nunit = "ms"\n'
         (IMU, "top level: .*`time`"),
         (f"{TIME}speed = 3\n{IMU}", "time: .*unknown field `speed`"),
         (f'[time]\ncolumn = "t"\nunit = "h"\n{IMU}', "time.unit: Invalid enum value 'h'; one of s, ms"),
-        (f"[time]\n{IMU}", "time: give either time.column or time.rate_hz"),
+        (f"[time]\n{IMU}", "time: give time.column, time.rate_hz, or both"),
         (
             f'[time]\ncolumn = "when"\n{IMU}',
             "time.column: table.csv has no column 'when'; it has t, ax, ay, az",
@@ -357,7 +357,7 @@ def test_missing_mapping_and_wrong_format(tmp_path: Path) -> None:
         convert(tmp_path / "t.csv", tmp_path / "o.mcap", mapping=tmp_path / "gone.toml")
     with pytest.raises(UsageError, match="mapping"):
         convert(tmp_path / "t.csv", tmp_path / "o.mcap", format="table")
-    with pytest.raises(UsageError, match="--map belongs to the format table"):
+    with pytest.raises(UsageError, match="--map belongs to the formats table"):
         convert(tmp_path / "t.csv", tmp_path / "o.mcap", format="mpu6050-serial", mapping="m.toml")
 
 

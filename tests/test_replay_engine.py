@@ -11,9 +11,9 @@ import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from marcha.algorithms import Input, Output, PlainEstimator, Remark
+from marcha.algorithms import Annotate, Input, Output, Remark, RowEstimator
 from marcha.recording import MarchaError, UsageError
-from marcha.replay import GapPolicy, ManualClock
+from marcha.replay import GapPolicy, ManualClock, Sink
 
 from .replay_helpers import (
     ACC,
@@ -123,12 +123,14 @@ def test_a_sink_that_cannot_rewind_sees_every_message_once(back: int, forth: int
     assert same_bits(sink.joined(), straight.joined())
 
 
-class StandsWhilePositive(PlainEstimator):
+class StandsWhilePositive(RowEstimator):
     """Still where the first value is positive."""
 
     name = "stands"
     inputs = (Input("imu", IMU, ("acc_x",)),)
-    outputs = (Output("stance", "marcha_msgs/msg/Stance", ("still",)),)
+    outputs = (
+        Output("stance", "marcha_msgs/msg/Stance", ("still",), annotate=Annotate("stance", "state", "still")),
+    )
 
     def step(self, row: np.ndarray) -> np.ndarray:
         return (row[1:] > 0).astype(float)
@@ -182,7 +184,7 @@ def test_a_range_that_ends_before_its_start_is_refused() -> None:
         engine_of(two_feet(), [Echo()], start_ns=5, end_ns=5)
 
 
-class Watcher:
+class Watcher(Sink):
     """Takes everything down."""
 
     def __init__(self) -> None:
@@ -302,7 +304,7 @@ def test_a_result_before_its_latency_is_an_error() -> None:
         engine.play()
 
 
-class Centred(PlainEstimator):
+class Centred(RowEstimator):
     """Needs the future: subtracts the mean of the whole walk."""
 
     name = "centred"

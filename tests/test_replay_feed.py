@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from marcha.algorithms import Input
 from marcha.recording import UsageError
 from marcha.replay import GapPolicy
-from marcha.replay.feed import Merged
+from marcha.replay.merging import Merged
 from marcha.replay.sources import Batch, measured_rate
 
 from .replay_helpers import ACC, IMU, MAG, STEP_NS, Echo, MemorySource, channel, oracle_rows, run_all, table

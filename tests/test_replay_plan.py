@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 import pytest
-from marcha.algorithms import Input, Output, PlainEstimator
+from marcha.algorithms import Input, Output, RowEstimator
 from marcha.recording import UsageError
 from marcha.replay import EstimatorSpec, parse_estimator, plan_runs
 
@@ -78,7 +78,7 @@ def test_runs_never_share_an_instance() -> None:
     assert len({id(a.estimator), id(b.estimator), id(mine)}) == 3
 
 
-class Tunable(PlainEstimator):
+class Tunable(RowEstimator):
     class Params(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         gain: Annotated[float, msgspec.Meta(gt=0)] = 1.0
         rate_hz: float = 0.0
@@ -174,7 +174,7 @@ def test_a_further_input_is_the_one_beside_the_first() -> None:
         ("/right/imu", IMU, ACC),
         ("/right/mag", MAG, MAG_COLUMNS),
     )
-    assert [[t for t, _ in r.inputs] for r in plan_runs(feet, [NEEDS_MAG])] == [
+    assert [[t for t, _ in r.row_inputs] for r in plan_runs(feet, [NEEDS_MAG])] == [
         ["/left/imu", "/left/mag"],
         ["/right/imu", "/right/mag"],
     ]
@@ -182,21 +182,21 @@ def test_a_further_input_is_the_one_beside_the_first() -> None:
 
 def test_an_optional_input_that_is_not_there_is_none() -> None:
     (run,) = plan_runs(source(("/foot/imu", IMU, ACC)), [WITH_MAG])
-    assert [t for t, _ in run.inputs] == ["/foot/imu", None]
+    assert [t for t, _ in run.row_inputs] == ["/foot/imu", None]
     assert run.findings == ()
 
 
 def test_an_ambiguous_optional_input_is_left_out_and_said() -> None:
     two = source(("/foot/imu", IMU, ACC), ("/foot/mag1", MAG, MAG_COLUMNS), ("/foot/mag2", MAG, MAG_COLUMNS))
     (run,) = plan_runs(two, [WITH_MAG])
-    assert run.inputs[1][0] is None
+    assert run.row_inputs[1][0] is None
     assert [f.kind for f in run.findings] == ["ambiguous_input"]
 
 
 def test_a_named_further_input_is_taken() -> None:
     two = source(("/foot/imu", IMU, ACC), ("/foot/mag1", MAG, MAG_COLUMNS), ("/foot/mag2", MAG, MAG_COLUMNS))
     (run,) = plan_runs(two, [WITH_MAG], inputs=["/foot/imu", "/foot/mag2"])
-    assert run.inputs[1][0] == "/foot/mag2"
+    assert run.row_inputs[1][0] == "/foot/mag2"
 
 
 def test_a_required_input_that_is_not_there_is_refused() -> None:
@@ -215,13 +215,34 @@ class Pair(Echo):
 
 def test_a_pair_of_sensors_is_one_run_in_the_order_named() -> None:
     (run,) = plan_runs(two_imus(), [Pair()], inputs=["/foot/imu2", "/foot/imu1"])
-    assert [t for t, _ in run.inputs] == ["/foot/imu2", "/foot/imu1"]
+    assert [t for t, _ in run.row_inputs] == ["/foot/imu2", "/foot/imu1"]
 
 
 def test_a_pair_among_three_must_be_named() -> None:
-    three = source(("/a/imu", IMU, ACC), ("/b/imu", IMU, ACC), ("/c/imu", IMU, ACC))
-    with pytest.raises(UsageError, match="name them in order"):
+    three = source(("/x/imu", IMU, ACC), ("/y/imu", IMU, ACC), ("/z/imu", IMU, ACC))
+    with pytest.raises(UsageError, match="name them with --input a=TOPIC"):
         plan_runs(three, [Pair()])
+
+
+def test_topics_that_have_the_inputs_names_are_theirs() -> None:
+    legs = source(("/leg/c/imu", IMU, ACC), ("/leg/b/imu", IMU, ACC), ("/leg/a/imu", IMU, ACC))
+    (run,) = plan_runs(legs, [Pair()])
+    assert run.topics == {"a": ("/leg/a/imu",), "b": ("/leg/b/imu",)}
+
+
+def test_roles_are_named_by_the_user() -> None:
+    (run,) = plan_runs(two_imus(), [Pair()], inputs=["b=/foot/imu1", "a=/foot/imu2"])
+    assert run.topics == {"a": ("/foot/imu2",), "b": ("/foot/imu1",)}
+
+
+def test_a_choice_by_order_is_said() -> None:
+    (run,) = plan_runs(two_imus(), [Pair()])
+    assert [f.kind for f in run.findings] == ["attached_by_order"]
+
+
+def test_a_role_that_nobody_has_is_refused() -> None:
+    with pytest.raises(UsageError, match="thigh"):
+        plan_runs(two_imus(), [Pair()], inputs=["thigh=/foot/imu1"])
 
 
 def test_outputs_become_topics_with_their_origin() -> None:

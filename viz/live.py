@@ -11,6 +11,7 @@ import polars as pl
 from ..recording import Recording
 from ..recording.atomic import AtomicFile
 from ..recording.errors import UsageError
+from ..replay.sinks import Sink
 from . import viewer
 from .text import printable
 from .viewer import Viewer
@@ -92,7 +93,7 @@ _BEAT_NS = 100_000_000
 and topic would not keep up with real time."""
 
 
-class LiveSink:
+class LiveSink(Sink):
     """A replay's sink that shows everything as it comes: in a file, a viewer, a browser, or all of them.
 
     Parameters

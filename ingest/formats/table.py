@@ -66,23 +66,50 @@ class Table:
         map_file = Path(options.mapping)
         mapping = read_mapping(map_file)
         report = ReportBuilder()
-        channels, by_file = [], {}
-        for i, topic in enumerate(mapping.topic):
-            file = _file_of(paths[0], topic, f"{map_file}: topic[{i}].file")
-            found = targets(map_file, mapping, i, topic)
-            by_file.setdefault(file, []).append((f"{map_file}: topic[{i}]", topic, found))
-            names = tuple(t.name for t in found)
-            channels.append(ChannelSpec(topic.name, schema_name(topic), topic.frame, names, topic.metadata))
-        files = [
-            _File(map_file, f, mapping, topics, report, subject=f"{f.name}: " if len(by_file) > 1 else "")
-            for f, topics in by_file.items()
-        ]
+        channels, blocks = open_table(paths[0], mapping, map_file, report)
         text = map_file.read_text(encoding="utf-8")
         metadata = {
             "device": {"clock": mapping.time.clock, **mapping.device},
             "mapping": {"file": map_file.name, "toml": text},
         }
-        return Import(channels=channels, blocks=_blocks(files, report), report=report, metadata=metadata)
+        return Import(channels=channels, blocks=blocks, report=report, metadata=metadata)
+
+
+def open_table(
+    path: Path, mapping: Mapping, map_file: Path, report: ReportBuilder
+) -> tuple[list[ChannelSpec], Iterator[tuple[str, pl.DataFrame]]]:
+    """Return the channels of a mapped table, and the blocks that read it.
+
+    Importers of text whose columns say themselves what they mean make a mapping of them and read it so.
+
+    Parameters
+    ----------
+    path : Path
+        The file, or the folder of the files that the topics name.
+    mapping : Mapping
+        What the columns mean.
+    map_file : Path
+        Where the mapping stands, for messages.
+    report : ReportBuilder
+        Takes what is found.
+
+    Raises
+    ------
+    MarchaError
+        The file is not as the mapping says.
+    """
+    channels, by_file = [], {}
+    for i, topic in enumerate(mapping.topic):
+        file = _file_of(path, topic, f"{map_file}: topic[{i}].file")
+        found = targets(map_file, mapping, i, topic)
+        by_file.setdefault(file, []).append((f"{map_file}: topic[{i}]", topic, found))
+        names = tuple(t.name for t in found)
+        channels.append(ChannelSpec(topic.name, schema_name(topic), topic.frame, names, topic.metadata))
+    files = [
+        _File(map_file, f, mapping, topics, report, subject=f"{f.name}: " if len(by_file) > 1 else "")
+        for f, topics in by_file.items()
+    ]
+    return channels, _blocks(files, report)
 
 
 def _file_of(path: Path, topic: Topic, key: str) -> Path:
@@ -157,10 +184,11 @@ class _File:
         ]
         self._rows = 0
         self._last: dict[str, tuple[object, ...]] = {}
-        tick = 1 if mapping.time.rollover is None else TICKS_NS.get(mapping.time.unit, 1)
-        self._clock = Clock(
-            report, tick_ns=tick, period=mapping.time.rollover, subject=subject, even=mapping.time.even
-        )
+        time, period = mapping.time, mapping.time.rollover
+        tick = 1 if period is None else TICKS_NS.get(time.unit, 1)
+        if time.column is not None and time.rate_hz is not None:  # samples, which are no whole nanoseconds
+            tick, period = 1, period and round(period * 1e9 / time.rate_hz)
+        self._clock = Clock(report, tick_ns=tick, period=period, subject=subject, even=time.even)
         self._tick = tick
         self._checks = {
             topic.name: check for topic, found in self._topics if (check := self._check(topic, found))
@@ -198,10 +226,12 @@ class _File:
         """Return ``t`` (ticks), ``line`` and columns ``<topic> <column>``, rows without time left out."""
         lines = block["line"]
         columns: dict[str, pl.Series] = {"t": self._ticks(block), "line": lines}
-        for _, found in self._topics:
+        for topic, found in self._topics:
+            many = schema_name(topic) == "marcha_msgs/msg/OpticalMarkers"  # a gap hides dozens of columns
             for name, target, place in found:
                 if place is not None:
-                    columns[name] = self._column(name, target, block[f"c{place}"], lines)
+                    text = block[f"c{place}"]
+                    columns[name] = self._column(name, target, text, lines, topic.name if many else name)
         frame = pl.DataFrame(columns)
         values = [c for c in frame.columns if c not in ("t", "line")]
         timeless = frame["t"].is_null()
@@ -247,11 +277,16 @@ class _File:
                 raise MarchaError(f"time.format: {form!r}: {str(error).splitlines()[0]}") from error
         if self._layout.decimal_comma:
             text = text.str.replace(",", ".", literal=True)
+        if time.rate_hz is not None:
+            count = text.cast(pl.Int64, strict=False).cast(pl.Float64)
+            return (count * (1e9 / time.rate_hz)).round(0).cast(pl.Int64)
         # Decimals keep nanoseconds that a float of epoch seconds loses.
         scale = TICKS_NS[time.unit] // self._tick
         return (text.cast(pl.Decimal(38, 9), strict=False) * scale).round(0).cast(pl.Int64, strict=False)
 
-    def _column(self, name: str, target: Target, text: pl.Series, lines: pl.Series) -> pl.Series:
+    def _column(
+        self, name: str, target: Target, text: pl.Series, lines: pl.Series, subject: str
+    ) -> pl.Series:
         text = text.str.strip_chars()
         given = text.is_not_null() & (text != "") & ~text.is_in(list(self._layout.missing))
         if not given.all():
@@ -260,7 +295,7 @@ class _File:
                 f"{name}: no value; NaN in the recording, or no message where a whole sensor is missing",
                 count=int((~given).sum()),
                 line=lines[int((~given).arg_true()[0])],
-                subject=name,
+                subject=subject,
             )
         text = _only(text, given)
         if target.kind == "text":
@@ -271,7 +306,7 @@ class _File:
             return self._readable(name, text, _only(yes, yes | no), lines)
         dotted = text.str.replace(",", ".", literal=True)
         value = (dotted if self._layout.decimal_comma else text).cast(pl.Float64, strict=False)
-        comma = (text.str.contains(r"^[+-]?\d+,\d+$") & value.is_null()).fill_null(False)
+        comma = (text.str.contains(r"^[+-]?\d+,\d+([eE][+-]?\d+)?$") & value.is_null()).fill_null(False)
         if comma.any():
             at = int(comma.arg_true()[0])
             self._report.repair(

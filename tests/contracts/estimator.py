@@ -1,12 +1,230 @@
-"""The contract of every estimator: inherit it, say how to make yours and what rows it takes."""
+"""The contract of every estimator: inherit it, say how to make yours and what messages or rows it takes.
+
+:class:`EstimatorContract` is for estimators that take messages, :class:`RowEstimatorContract` for those that
+take rows.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
+import polars as pl
 import pytest
-from marcha.algorithms import AlgorithmError, describe, input_columns, make, output_columns
+from marcha.algorithms import (
+    ALL_COLUMNS,
+    AlgorithmError,
+    ChannelInfo,
+    Context,
+    KernelEstimator,
+    Message,
+    Result,
+    describe,
+    input_columns,
+    make,
+    output_columns,
+)
+
+TIMES = ("t_ns", "t_log_ns")
+Tables = Mapping[str, Mapping[str, pl.DataFrame]]
+"""``{input name: {topic: table}}``; a table has ``t_ns``, the input's columns, and ``t_log_ns`` where it differs."""
+
+
+def context_of(estimator: Any, tables: Tables) -> Context:
+    """Return the context of these channels; their rates are the medians of their intervals."""
+    channels: dict[str, tuple[ChannelInfo, ...]] = {}
+    for need in estimator.inputs:
+        found = []
+        for topic, table in tables.get(need.name, {}).items():
+            columns = tuple(c for c in table.columns if c not in TIMES)
+            steps = np.diff(table["t_ns"].to_numpy())
+            rate = 1e9 / float(np.median(steps)) if steps.size and np.median(steps) > 0 else 0.0
+            wanted = columns if need.columns == ALL_COLUMNS else need.columns
+            found.append(ChannelInfo(topic, need.schema, "", wanted, rate))
+        channels[need.name] = tuple(found)
+    return Context(channels)
+
+
+def messages_of(estimator: Any, tables: Tables) -> list[Message]:
+    """Return the messages of all tables by log time; ties by the order of inputs and channels."""
+    found: list[Message] = []
+    for need in estimator.inputs:
+        for topic, table in tables.get(need.name, {}).items():
+            columns = [c for c in table.columns if c not in TIMES]
+            wanted = columns if need.columns == ALL_COLUMNS else list(need.columns)
+            logs = table["t_log_ns" if "t_log_ns" in table.columns else "t_ns"].to_list()
+            rows = table.select(wanted).rows()
+            for t_ns, log_ns, values in zip(table["t_ns"].to_list(), logs, rows, strict=True):
+                found.append(Message(need.name, t_ns, values, log_ns, topic))
+    return sorted(found, key=lambda m: m.log_ns)
+
+
+class DeclarationContract:
+    """What every estimator says about itself."""
+
+    name: str = ""
+    params: ClassVar[dict[str, Any]] = {}
+
+    def make(self) -> Any:
+        return make(self.name, **self.params)
+
+    def test_names_are_there_and_unique(self) -> None:
+        estimator = self.make()
+        assert estimator.name
+        assert estimator.inputs
+        assert len({i.name for i in estimator.inputs}) == len(estimator.inputs)
+        assert not all(i.optional for i in estimator.inputs)
+
+    def test_every_parameter_says_what_it_does(self) -> None:
+        for parameter in describe(type(self.make()).Params):
+            assert parameter.effect, parameter.name
+            assert parameter.default is not None, parameter.name
+
+    def test_every_preset_builds(self) -> None:
+        cls = type(self.make())
+        for preset in cls.presets:
+            assert cls(cls.Params(**cls.presets[preset])).inputs
+
+    def test_unknown_parameter_is_one_line(self) -> None:
+        if not self.name:
+            pytest.skip("not registered")
+        with pytest.raises(AlgorithmError, match="no parameter 'no_such_thing'") as error:
+            make(self.name, no_such_thing=1)
+        assert "\n" not in str(error.value)
+
+
+class EstimatorContract(DeclarationContract):
+    """Subclass as ``class TestMine(EstimatorContract)``; set ``name`` or override :meth:`make`, give tables.
+
+    What it promises: results of declared outputs only, each with all its columns and none from the future; the
+    same results for the same messages whether it was interrupted (snapshot, restore) or not, and, for a kernel,
+    however the messages are cut into blocks; tables that are left as they were; remarks that can be read at any
+    time, also before the first message.
+    """
+
+    def tables(self) -> Tables:
+        """Return typical messages by input and topic."""
+        raise NotImplementedError
+
+    def context(self, estimator: Any) -> Context:
+        """Return what the estimator is told before the first message."""
+        return context_of(estimator, self.tables())
+
+    def started(self) -> Any:
+        """Return a fresh estimator that has seen its context."""
+        estimator = self.make()
+        estimator.start(self.context(estimator))
+        return estimator
+
+    def test_outputs_are_declared_after_the_start(self) -> None:
+        estimator = self.started()
+        names = [o.name for o in estimator.outputs]
+        assert names
+        assert len(set(names)) == len(names)
+        for output in estimator.outputs:
+            assert len(set(output.columns)) == len(output.columns) > 0
+
+    def test_results_are_as_declared_and_not_from_the_future(self) -> None:
+        estimator = self.started()
+        declared = {o.name: len(o.columns) for o in estimator.outputs}
+        count = 0
+        for message in messages_of(estimator, self.tables()):
+            for result in estimator.take(message) or ():
+                assert isinstance(result, Result)
+                assert len(result.values) == declared[result.output]
+                assert result.t_ns <= max(message.t_ns, message.log_ns)
+                count += 1
+        count += sum(1 for _ in estimator.finish() or ())
+        assert count > 0
+
+    def test_an_interrupted_run_equals_an_uninterrupted_one(self) -> None:
+        whole = self.started()
+        messages = messages_of(whole, self.tables())
+        expected = [list(whole.take(m) or ()) for m in messages]
+        ended = list(whole.finish() or ())
+        for at in (0, 1, len(messages) // 3, len(messages) - 1):
+            one = self.started()
+            head = [list(one.take(m) or ()) for m in messages[:at]]
+            kept = one.snapshot()
+            for m in messages[at : at + 50]:  # goes astray
+                list(one.take(m) or ())
+            one.restore(kept)
+            assert _same(head + [list(one.take(m) or ()) for m in messages[at:]], expected)
+            assert _same([list(one.finish() or ())], [ended])
+            other = self.started()
+            other.restore(kept)
+            assert _same([list(other.take(m) or ()) for m in messages[at:]], expected[at:])
+
+    def test_blocks_of_any_size_equal_single_messages(self) -> None:
+        estimator = self.started()
+        if not isinstance(estimator, KernelEstimator):
+            pytest.skip("takes single messages only")
+        messages = messages_of(estimator, self.tables())
+        expected = [list(estimator.take(m) or ()) for m in messages]
+        inputs = np.array([[i.name for i in estimator.inputs].index(m.input) for m in messages])
+        channels = np.array(
+            [estimator.channel_index(int(i), m.channel) for i, m in zip(inputs, messages, strict=True)]
+        )
+        t_ns = np.array([m.t_ns for m in messages], np.int64)
+        values = _encoded(estimator, inputs, channels, messages)
+        for size in (1, 7, len(messages)):
+            block, got = self.started(), []
+            for a in range(0, len(messages), size):
+                b = min(a + size, len(messages))
+                room = (b - a) * block.max_results
+                whose, when = np.empty(room, np.int64), np.empty(room, np.int64)
+                out = np.empty((room, block.width))
+                n = int(
+                    block.run(
+                        block.state, inputs[a:b], channels[a:b], t_ns[a:b], values[a:b], whose, when, out
+                    )
+                )
+                assert (np.diff(whose[:n]) >= 0).all()
+                got += block.results(when[:n], out[:n])
+            assert _same([got], [[r for results in expected for r in results]])
+
+    def test_tables_are_not_changed(self) -> None:
+        estimator, tables = self.started(), self.tables()
+        before = {i: {t: v.clone() for t, v in by.items()} for i, by in tables.items()}
+        for message in messages_of(estimator, tables):
+            list(estimator.take(message) or ())
+        assert all(v.equals(before[i][t]) for i, by in tables.items() for t, v in by.items())
+
+    def test_remarks_can_be_read_at_any_time(self) -> None:
+        estimator = self.started()
+        assert isinstance(estimator.remarks(), list)
+        for message in messages_of(estimator, self.tables()):
+            list(estimator.take(message) or ())
+        assert isinstance(estimator.remarks(), list)
+
+
+def _encoded(estimator: KernelEstimator, inputs: Any, channels: Any, messages: list[Message]) -> np.ndarray:
+    rows = []
+    for index, channel, message in zip(inputs.tolist(), channels.tolist(), messages, strict=True):
+        columns = estimator.inputs[index].columns
+        if columns == ALL_COLUMNS:
+            columns = tuple(f"column_{i}" for i in range(len(message.values)))
+        table = pl.DataFrame({c: [v] for c, v in zip(columns, message.values, strict=True)})
+        rows.append(estimator.encode(index, channel, table)[0])
+    values = np.full((len(rows), max(len(r) for r in rows)), np.nan)
+    for i, row in enumerate(rows):
+        values[i, : len(row)] = row
+    return values
+
+
+def _same(a: list[list[Result]], b: list[list[Result]]) -> bool:
+    """Return whether results are the same to the bit (NaN equals NaN)."""
+    return len(a) == len(b) and all(
+        len(x) == len(y)
+        and all(
+            p.output == q.output
+            and p.t_ns == q.t_ns
+            and all(u == v or (u != u and v != v) for u, v in zip(p.values, q.values, strict=True))
+            for p, q in zip(x, y, strict=True)
+        )
+        for x, y in zip(a, b, strict=True)
+    )
 
 
 def results_of(estimator: Any, rows: np.ndarray) -> list[np.ndarray | None]:
@@ -22,51 +240,24 @@ def equal(a: list[np.ndarray | None], b: list[np.ndarray | None]) -> bool:
     )
 
 
-class EstimatorContract:
-    """Subclass as ``class TestMine(EstimatorContract)``; set ``name`` or override :meth:`make`, give rows.
+class RowEstimatorContract(DeclarationContract):
+    """Subclass as ``class TestMine(RowEstimatorContract)``; set ``name`` or override :meth:`make`, give rows.
 
     What it promises: declared columns, latency as declared, the same bits for the same rows however they are
     handed over (one by one, in blocks of any size, after a snapshot and a restore), and rows that are left
     as they were.
     """
 
-    name: str = ""
-    params: ClassVar[dict[str, Any]] = {}
-
-    def make(self) -> Any:
-        return make(self.name, **self.params)
-
     def rows(self) -> np.ndarray:
         """Return typical rows, shape (n, inputs), n at least 300."""
         raise NotImplementedError
 
-    def test_names_are_there_and_unique(self) -> None:
-        estimator = self.make()
-        assert estimator.name
-        assert estimator.inputs
-        assert not estimator.inputs[0].optional
-        columns = output_columns(estimator)
+    def test_columns_are_there_and_unique(self) -> None:
+        columns = output_columns(self.make())
         assert len(set(columns)) == len(columns) > 0
 
     def test_rows_fit_the_inputs(self) -> None:
         assert self.rows().shape[1] == len(input_columns(self.make()))
-
-    def test_every_parameter_says_what_it_does(self) -> None:
-        for parameter in describe(type(self.make()).Params):
-            assert parameter.effect, parameter.name
-            assert parameter.default is not None, parameter.name
-
-    def test_every_preset_builds(self) -> None:
-        cls = type(self.make())
-        for preset in cls.presets:
-            assert cls(cls.Params(**cls.presets[preset])).outputs
-
-    def test_unknown_parameter_is_one_line(self) -> None:
-        if not self.name:
-            pytest.skip("not registered")
-        with pytest.raises(AlgorithmError, match="no parameter 'no_such_thing'") as error:
-            make(self.name, no_such_thing=1)
-        assert "\n" not in str(error.value)
 
     def test_results_lag_by_the_latency(self) -> None:
         estimator, rows = self.make(), self.rows()

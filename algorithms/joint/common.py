@@ -1,0 +1,241 @@
+"""What joint estimators share: inputs by segment, the encoder's columns, mountings, remarks about the sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import msgspec
+import numpy as np
+
+from ..contract import ALL_COLUMNS, AlgorithmError, Context, FloatArray, Input, KernelEstimator, Remark
+from ..parameters import meta
+from . import merge
+from .merge import ENCODER, JOINTS, SEGMENTS
+
+if TYPE_CHECKING:
+    import polars as pl
+
+IMU_COLUMNS = ("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z")
+
+
+def imu(name: str, optional: bool = False) -> Input:
+    """Return the input of a segment's sensor."""
+    return Input(name, "sensor_msgs/msg/Imu", IMU_COLUMNS, optional=optional, regular=True)
+
+
+def encoder(optional: bool = False) -> Input:
+    """Return the input of the joints' encoders."""
+    return Input("encoder", "sensor_msgs/msg/JointState", ALL_COLUMNS, optional=optional)
+
+
+class MergeParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How sensors of different rates meet, and how they sit on their segments."""
+
+    hold_s: Annotated[
+        float,
+        meta(
+            "How long a sample of the first segment waits for the other sensors before they count as missing",
+            "s",
+            "ours",
+            gt=0.0,
+            le=10.0,
+        ),
+    ] = 0.25
+    gap_s: Annotated[
+        float,
+        meta(
+            "Longest pause that is interpolated; after a longer one a segment begins anew",
+            "s",
+            "ours",
+            gt=0.0,
+        ),
+    ] = 0.2
+    gravity: Annotated[float, meta("Local gravity", "m/s²", "source", gt=0.0, le=30.0)] = 9.81
+    axis: Annotated[
+        str,
+        meta(
+            "Flexion axis in the frame of every sensor: x, -x, y … or three numbers; per segment after its name "
+            "(thigh=x shank=-y). A joint calibration goes before it",
+            source="source: x",
+        ),
+    ] = "x"
+    up: Annotated[
+        str,
+        meta(
+            "Long axis of the segment, upwards, in the sensor's frame, written as axis; empty: z for axis x, "
+            "x for y, y for z",
+            source="source: z",
+        ),
+    ] = ""
+
+
+def vector(text: str, name: str) -> FloatArray:
+    """Return the unit vector that ``text`` names: ``x``, ``-z``, ``0.1,0.9,0``."""
+    plain = text.strip().lstrip("+")
+    sign = -1.0 if plain.startswith("-") and plain[1:] in ("x", "y", "z") else 1.0
+    word = plain.lstrip("-")
+    if word in ("x", "y", "z"):
+        return sign * np.eye(3)["xyz".index(word)]
+    try:
+        found = np.array([float(part) for part in plain.replace(",", " ").split()])
+    except ValueError:
+        found = np.zeros(0)
+    if found.shape != (3,) or not np.isfinite(found).all() or np.linalg.norm(found) < 1e-6:
+        raise AlgorithmError(
+            f"{name} = {text!r} is no direction; must be x, -x, y, -y, z, -z or three numbers like 0.1,0.9,0"
+        )
+    return found / np.linalg.norm(found)
+
+
+def per_segment(text: str, segment: str) -> str:
+    """Return the part of ``text`` that is about ``segment``: ``thigh=x shank=-y`` or one for all."""
+    if "=" not in text:
+        return text
+    parts = dict(part.split("=", 1) for part in text.split() if "=" in part)
+    unknown = sorted(set(parts) - {*SEGMENTS, "imu"})
+    if unknown:
+        raise AlgorithmError(f"axis: no segment {unknown[0]!r}; must be one of {', '.join(SEGMENTS)}")
+    return parts.get(segment, "")
+
+
+def mount_of(axis: FloatArray, up: FloatArray | None) -> FloatArray:
+    """Return the rotation from sensor to segment, rows x = flexion axis, y, z = long axis made square to it."""
+    if up is None:
+        along = np.abs(axis).max() > 0.999
+        up = np.abs(np.roll(axis, 2)) if along else np.eye(3)[int(np.argmin(np.abs(axis)))]
+    z = up - (up @ axis) * axis
+    if np.linalg.norm(z) < 0.1:
+        raise AlgorithmError("up lies along axis; they must be two directions at least 6° apart")
+    z = z / np.linalg.norm(z)
+    return np.array([axis, np.cross(z, axis), z])
+
+
+def mounts(params: Any, segments: Sequence[str], context: Context | None) -> FloatArray:
+    """Return sensor-to-segment rotations (n, 3, 3): by the joint calibration, else by the parameters."""
+    found = np.zeros((len(segments), 3, 3))
+    calibration = context.calibrations.get("joint") if context is not None else None
+    for i, segment in enumerate(segments):
+        key = f"rot_sb_{segment}"
+        if calibration is not None and calibration.usable and key in calibration.values:
+            found[i] = calibration.array(key)
+            continue
+        axis = vector(per_segment(params.axis, segment) or "x", "axis")
+        up = per_segment(params.up, segment)
+        found[i] = mount_of(axis, vector(up, "up") if up else None)
+    return found
+
+
+def joint_name(upper: str, lower: str) -> str:
+    """Return the name of the joint between two segments: hip, knee, ankle, or both names."""
+    a, b = (SEGMENTS.index(s) if s in SEGMENTS else -9 for s in (upper, lower))
+    return JOINTS[a] if b == a + 1 and a >= 0 else f"{upper}-{lower}"
+
+
+class JointEstimator(KernelEstimator):
+    """Base of the joint estimators: which segments are there, the merging of their messages, remarks."""
+
+    max_results = 2
+    max_held = merge.RING + merge.LINE
+    dtype: np.dtype[Any]
+    lookahead = 0
+    least = 1
+    """Fewest segments that make sense."""
+
+    def __init__(self, params: msgspec.Struct | None = None) -> None:
+        super().__init__(params)
+        self.segments: tuple[str, ...] = tuple(i.name for i in self.inputs if i.name != "encoder")
+        self.encoder_columns: tuple[str, ...] = ()
+        self.state = np.zeros(1, self.dtype)
+        self.context = Context()
+        self._lay(Context())
+
+    def start(self, context: Context) -> None:
+        """Take the segments that are attached, their mountings and calibrations."""
+        super().start(context)
+        self.context = context
+        known = [i.name for i in self.inputs if i.name != "encoder"]
+        self.segments = tuple(n for n in known if context.has(n)) or tuple(known)
+        if len(self.segments) < self.least:
+            raise AlgorithmError(
+                f"{self.name}: {len(self.segments)} segment attached ({', '.join(self.segments)}), needs at least "
+                f"{self.least} of {', '.join(known)}; attach one with --input NAME=TOPIC"
+            )
+        self.encoder_columns = context.channels["encoder"][0].columns if context.has("encoder") else ()
+        self.state = np.zeros(1, self.dtype)
+        self._lay(context)
+
+    def joint_names(self) -> tuple[str, ...]:
+        """Return the names of the joints between the attached segments."""
+        return tuple(joint_name(a, b) for a, b in zip(self.segments, self.segments[1:], strict=False))
+
+    def _lay(self, context: Context) -> None:
+        s, p = self.state[0], self.params
+        s["n"] = len(self.segments)
+        s["on"][: len(self.segments)] = 1
+        s["on"][ENCODER] = context.has("encoder")
+        for index, need in enumerate(self.inputs):
+            s["stream"][index] = (
+                ENCODER
+                if need.name == "encoder"
+                else self.segments.index(need.name)
+                if need.name in self.segments
+                else 0
+            )
+        s["hold_ns"], s["gap_ns"] = round(p.hold_s * 1e9), round(p.gap_s * 1e9)
+        s["lookahead"] = self.lookahead
+        s["seen"] = merge.NEVER
+        s["newest"] = merge.NEVER
+        self.lay(context)
+
+    def lay(self, context: Context) -> None:
+        """Write parameters into the state and set ``outputs``."""
+
+    def encode(self, index: int, channel: int, table: pl.DataFrame) -> FloatArray:
+        """Return a channel's values; of an encoder those of the joints between the attached segments."""
+        if self.inputs[index].name != "encoder":
+            return super().encode(index, channel, table)
+        out = np.full((table.height, 3), np.nan)
+        columns = [c for c in table.columns if c not in ("t_ns", "t_log_ns")]
+        names = self.encoder_columns or tuple(columns)
+        plain = [i for i, c in enumerate(names) if not c.endswith((".vel", ".effort"))]
+        joints = self.joint_names()
+        for j, joint in enumerate(joints):
+            fit = [i for i in plain if joint in names[i].lower()]
+            if not fit and len(joints) == 1 and len(plain) == 1:
+                fit = plain
+            if fit and fit[0] < len(columns):
+                out[:, j] = table[columns[fit[0]]].to_numpy()
+        return out
+
+    def snapshot(self) -> Any:
+        """Return a copy of the packed state."""
+        return self.state.copy()
+
+    def remarks(self) -> list[Remark]:
+        """Say which sensors were missing."""
+        s = self.state[0]
+        total = int(s["samples"])
+        found: list[Remark] = []
+        if total == 0:
+            return found
+        if int(s["given"]) == 0 or ("on_line" in (self.dtype.names or ()) and s["on_line"] == 0):
+            found.append(
+                Remark(
+                    "no_overlap",
+                    f"{', '.join(self.segments)} have no time in common; align their clocks or choose other channels",
+                    fatal=True,
+                )
+            )
+        streams: Mapping[int, str] = {**dict(enumerate(self.segments)), ENCODER: "encoder"}
+        for i, name in streams.items():
+            missed = int(s["missed"][i])
+            if s["on"][i] and missed > max(2, total // 1000):
+                found.append(
+                    Remark(
+                        "sensor_missing",
+                        f"{name} had no value at {missed} of {total} samples of {self.segments[0]}; "
+                        "its angles are left out there",
+                    )
+                )
+        return found

@@ -1,0 +1,209 @@
+"""The angle of a hinge from two sensors alone: axes and position found on the way, angle by eqs 72–77.
+
+Of samples with both sensors valid every ``stride``-th is kept; when the store is full, every second is thrown away
+and the stride doubles, so that it always covers the whole run. The axes are identified anew (:mod:`.axisfit`)
+after 2 s and then each time the run is a quarter longer.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from ..numerics.compiled import compiled, inlined
+from . import axisfit
+
+STORE = 1024
+
+FIELDS: list[Any] = [
+    *axisfit.WORK,
+    ("base", "f8", (2, 2, 3)),  # x_i, y_i of eq 74 in each sensor's frame
+    ("up", "f8", (2, 3)),  # c of each sensor: the long axis of the segment
+    ("rows", "f8", (STORE, axisfit.COLUMNS)),
+    ("whole", "f8", (2, 3)),  # integral of each rate
+    ("kept", "i8"),
+    ("stride", "i8"),
+    ("skip", "i8"),
+    ("learn", "i8"),  # 0: axes are given; 1: axes; 2: axes and position
+    ("elapsed", "f8"),
+    ("fit_at", "f8"),
+    ("fits", "i8"),
+    ("known", "i8"),  # whether the axes are usable: given, or identified with a good verdict
+    ("sd_gyr", "f8"),
+    ("sd_acc", "f8"),
+    ("gravity", "f8"),
+    ("given_axis", "f8", (2, 3)),
+    # The angle.
+    ("alpha_acc", "f8"),
+    ("alpha_gyr", "f8"),
+    ("alpha_spread", "f8"),  # factor of the variance of alpha_acc, 1 where gravity lies across the axis
+    ("alpha", "f8"),
+    ("alpha_var", "f8"),
+    ("alpha_on", "i8"),
+    ("alpha_seel", "i8"),
+    ("alpha_lambda", "f8"),
+    ("alpha_r", "f8"),
+    ("alpha_q", "f8", (2,)),
+    ("alpha_decay", "f8"),
+    ("ax", "f8", (2,)),
+    ("aP", "f8", (2, 2)),
+]
+
+
+@inlined
+def near(angle: float, other: float) -> float:
+    """Return ``angle`` moved by whole turns to within half a turn of ``other``."""
+    return angle - 2.0 * math.pi * math.floor((angle - other) / (2.0 * math.pi) + 0.5)
+
+
+@compiled
+def set_base(s: Any) -> None:
+    """Write the bases across the axes: x_i = j_i × c_i normalized, y_i = j_i × x_i."""
+    for i in range(2):
+        jx, jy, jz = s.axis[i, 0], s.axis[i, 1], s.axis[i, 2]
+        x = jy * s.up[i, 2] - jz * s.up[i, 1]
+        y = jz * s.up[i, 0] - jx * s.up[i, 2]
+        z = jx * s.up[i, 1] - jy * s.up[i, 0]
+        size = math.sqrt(x * x + y * y + z * z)
+        if size < 0.1:  # c along the axis: any other direction, the same for both sensors
+            u0, u1, u2 = 0.0, 0.0, 1.0
+            if abs(jz) > 0.8:
+                u1, u2 = 1.0, 0.0
+            x, y, z = jy * u2 - jz * u1, jz * u0 - jx * u2, jx * u1 - jy * u0
+            size = math.sqrt(x * x + y * y + z * z)
+        x, y, z = x / size, y / size, z / size
+        s.base[i, 0, 0], s.base[i, 0, 1], s.base[i, 0, 2] = x, y, z
+        s.base[i, 1, 0] = jy * z - jz * y
+        s.base[i, 1, 1] = jz * x - jx * z
+        s.base[i, 1, 2] = jx * y - jy * x
+
+
+@compiled
+def identify(s: Any, lag: int) -> None:
+    """Find the axes, and the position, from the store; judge them (see :func:`verdict`)."""
+    n = s.kept
+    for i in range(2):
+        for m in range(3):
+            s.axis[i, m] = s.given_axis[i, m]
+    paired = axisfit.fit_axes(s, s.rows, n, lag, s.sd_gyr, s.sd_acc, s.gravity)
+    if s.learn == 2:
+        axisfit.fit_position(s, s.rows, n, 0.5)
+        paired = axisfit.fit_axes(s, s.rows, n, lag, s.sd_gyr, s.sd_acc, s.gravity)
+        axisfit.fit_position(s, s.rows, n, 0.5)
+        if s.pos_sd > 0.05:  # not observable: no lever rather than a wrong one
+            for i in range(2):
+                for m in range(3):
+                    s.pos[i, m] = 0.0
+    s.fits += 1
+    if paired and observable(s):
+        s.known = 1
+    else:
+        s.known = 0
+        for i in range(2):
+            for m in range(3):
+                s.axis[i, m] = s.given_axis[i, m]
+                s.pos[i, m] = 0.0
+
+
+@compiled
+def observable(s: Any) -> bool:
+    """Return whether the identified axes may be used."""
+    moved = s.turn_rms > 0.1 and s.rate_rms[0] > 0.05 and s.rate_rms[1] > 0.05
+    return moved and s.axis_sd[0] < 0.1 and s.axis_sd[1] < 0.1 and s.pairing > 0.6
+
+
+@compiled
+def watch(s: Any) -> bool:
+    """Keep the sample given out; return True where the axes were identified anew with it."""
+    s.elapsed += s.dt
+    if s.valid[0] == 0 or s.valid[1] == 0:
+        return False
+    for i in range(2):
+        for m in range(3):
+            s.whole[i, m] += s.turn[i, m]
+    s.skip += 1
+    if s.slope[0] == 0 or s.slope[1] == 0 or s.skip < s.stride:
+        return False
+    s.skip = 0
+    k = s.kept
+    for i in range(2):
+        b = axisfit.WIDTH * i
+        for m in range(3):
+            s.rows[k, b + axisfit.GYR + m] = s.gyr[i, m]
+            s.rows[k, b + axisfit.ACC + m] = s.acc[i, m]
+            s.rows[k, b + axisfit.DGYR + m] = s.dgyr[i, m]
+            s.rows[k, b + axisfit.SUM + m] = s.whole[i, m]
+    s.kept = k + 1
+    if s.kept == STORE:
+        for k in range(STORE // 2):
+            for m in range(axisfit.COLUMNS):
+                s.rows[k, m] = s.rows[2 * k, m]
+        s.kept = STORE // 2
+        s.stride *= 2
+    if s.elapsed < s.fit_at or s.kept < 60:
+        return False
+    s.fit_at = max(1.25 * s.elapsed, s.elapsed + 1.0)
+    lag = max(1, int(0.3 * s.kept / s.elapsed + 0.5))
+    identify(s, lag)
+    set_base(s)
+    return True
+
+
+@compiled
+def joint_angle(s: Any) -> None:
+    """Carry ``s.alpha`` over one sample (eqs 73, 74, 77, or Seel's form) with its variance."""
+    turn = 0.0
+    for m in range(3):
+        turn += s.turn[0, m] * s.axis[0, m] - s.turn[1, m] * s.axis[1, m]
+    s.alpha_gyr += turn
+    ux, uy, vx, vy = 0.0, 0.0, 0.0, 0.0
+    for i in range(2):
+        gx, gy, gz = s.gyr[i, 0], s.gyr[i, 1], s.gyr[i, 2]
+        ox, oy, oz = s.pos[i, 0], s.pos[i, 1], s.pos[i, 2]
+        along = gx * ox + gy * oy + gz * oz
+        size = gx * gx + gy * gy + gz * gz
+        fx = s.acc[i, 0] - (gx * along - ox * size) - (s.dgyr[i, 1] * oz - s.dgyr[i, 2] * oy)
+        fy = s.acc[i, 1] - (gy * along - oy * size) - (s.dgyr[i, 2] * ox - s.dgyr[i, 0] * oz)
+        fz = s.acc[i, 2] - (gz * along - oz * size) - (s.dgyr[i, 0] * oy - s.dgyr[i, 1] * ox)
+        a = fx * s.base[i, 0, 0] + fy * s.base[i, 0, 1] + fz * s.base[i, 0, 2]
+        b = fx * s.base[i, 1, 0] + fy * s.base[i, 1, 1] + fz * s.base[i, 1, 2]
+        if i == 0:
+            ux, uy = a, b
+        else:
+            vx, vy = a, b
+    uu, vv = ux * ux + uy * uy, vx * vx + vy * vy
+    g2 = s.gravity * s.gravity
+    s.alpha_spread = 0.5 * (g2 / max(uu, 1e-6 * g2) + g2 / max(vv, 1e-6 * g2))
+    s.alpha_acc = near(math.atan2(ux * vy - uy * vx, ux * vx + uy * vy), s.alpha)
+    if s.alpha_on == 0:
+        s.alpha_gyr = s.alpha_acc
+        s.alpha = s.alpha_acc
+        s.alpha_on = 1
+        s.ax[0], s.ax[1] = 0.0, 0.0
+        s.aP[0, 0], s.aP[0, 1], s.aP[1, 0], s.aP[1, 1] = 1.0, 0.0, 0.0, 1.0
+        s.alpha_var = s.alpha_r
+        return
+    r = s.alpha_r * max(1.0, s.alpha_spread)
+    if s.alpha_seel == 1:
+        weight = s.alpha_lambda / max(1.0, s.alpha_spread)
+        s.alpha = weight * near(s.alpha_acc, s.alpha) + (1.0 - weight) * (s.alpha + turn)
+        s.alpha_var = weight * weight * r + (1.0 - weight) ** 2 * s.alpha_var
+        return
+    # FKC, eqs 9–24, with z = α_acc − α_gyr.
+    t, d = s.dt, 1.0 - s.dt * s.alpha_decay
+    s.ax[0] += t * s.ax[1]
+    s.ax[1] *= d
+    p00 = s.aP[0, 0] + t * (s.aP[0, 1] + s.aP[1, 0]) + t * t * s.aP[1, 1] + t * t * s.alpha_q[0]
+    p01 = d * (s.aP[0, 1] + t * s.aP[1, 1])
+    p11 = d * d * s.aP[1, 1] + t * t * s.alpha_q[1]
+    total = p00 + r
+    k0, k1 = p00 / total, p01 / total
+    nu = near(s.alpha_acc - s.alpha_gyr, s.ax[0]) - s.ax[0]
+    s.ax[0] += k0 * nu
+    s.ax[1] += k1 * nu
+    s.aP[0, 0] = (1.0 - k0) ** 2 * p00 + k0 * k0 * r
+    s.aP[0, 1] = (1.0 - k0) * (p01 - k1 * p00) + k0 * k1 * r
+    s.aP[1, 0] = s.aP[0, 1]
+    s.aP[1, 1] = p11 - 2.0 * k1 * p01 + k1 * k1 * total
+    s.alpha = s.alpha_gyr + s.ax[0]
+    s.alpha_var = s.aP[0, 0]

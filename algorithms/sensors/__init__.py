@@ -1,0 +1,1 @@
+"""Calibration of inertial and magnetic sensors."""

@@ -1,0 +1,97 @@
+"""``marcha calibrate``: a look at recordings whose result later replays are given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from .console import Heading, Outcome, Table, progress
+from .errors import DEFECTS, DONE
+from .options import DEFAULT, Common, Force, MaybeOutput, Paths, Strings, instant, settings
+
+
+def calibrate(
+    name: str,
+    paths: Paths,
+    /,
+    *,
+    param: Annotated[Strings, Parameter(name=("--param", "-p"))] = (),
+    inputs: Annotated[Strings, Parameter(name="--input")] = (),
+    interval: str | None = None,
+    start: Annotated[str | None, Parameter(name="--from")] = None,
+    end: Annotated[str | None, Parameter(name="--to")] = None,
+    output: MaybeOutput = None,
+    force: Force = False,
+    common: Common = DEFAULT,
+) -> Outcome:
+    """Let a calibration look at recordings and write its result.
+
+    The file is handed to estimators by `marcha replay --calibration FILE`.
+    Exit code 3 says that the recordings do not determine it ("not
+    observable"); such a result is written for the record, but never applied.
+
+    Parameters
+    ----------
+    name : str
+        Calibration: imu, magnetometer …
+    paths : Path
+        Recordings that it looks at, together.
+    param : str
+        key=value; may be repeated.
+    inputs : str
+        ROLE=TOPIC, or a topic to attach to; may be repeated. Without it, every channel that fits, one result each.
+    interval : str
+        Label or tier of annotations: look only at what lies in them.
+    start : str
+        Start here: 12.5, 12.5s, 1m, 500ms after the recording's start, or @NANOSECONDS of its clock.
+    end : str
+        Stop before here; written like --from.
+    output : Path
+        File to write (JSON); with several results their subjects are added to the name.
+    force : bool
+        Replace existing outputs.
+    """
+    from .. import recording
+    from .. import replay as rp
+
+    recordings = [recording.open(path) for path in paths]
+    with progress("calibrate", common):
+        found = rp.calibrate(
+            name,
+            recordings,
+            settings(param, "--param"),
+            inputs=list(inputs) or None,
+            interval=interval,
+            start_ns=instant(start, recordings[0], "--from"),
+            end_ns=instant(end, recordings[0], "--to"),
+        )
+    written: list[Path] = []
+    for one in found:
+        if output is not None:
+            subject = "_".join(p for p in one.subject.split("/") if p)
+            target = (
+                output if len(found) == 1 else output.with_name(f"{output.stem}-{subject}{output.suffix}")
+            )
+            rp.save_calibration(one, target, overwrite=force)
+            written.append(target)
+    lines: list[Heading | Table] = []
+    for one in found:
+        verdict = "" if one.usable else ": NOT USABLE"
+        lines.append(Heading(f"{one.kind} of {one.subject or 'the recording'}{verdict}"))
+        lines.append(Table(["value", "is"], [(key, _shown(value)) for key, value in one.values.items()]))
+        lines += [Heading(f"note: {remark}") for remark in one.remarks]
+    lines += [Heading(f"written: {path}") for path in written]
+    import msgspec
+
+    document = {"calibrations": msgspec.to_builtins(found), "outputs": [str(w) for w in written]}
+    return Outcome(document, lines, DONE if all(c.usable for c in found) else DEFECTS)
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return "[" + ", ".join(_shown(v) for v in value) + "]"
+    return str(value)
