@@ -58,15 +58,24 @@ class Cells:
 
     def rows(self, columns: Sequence[int], report: ReportBuilder) -> Iterator[pl.DataFrame]:
         """Yield the wanted columns as text, named ``c<place>``, and ``line`` (Int64)."""
+        for block, line in self.blocks():
+            frame = self.parse(block, line, columns, report)
+            if frame.height:
+                yield frame
+
+    def blocks(self) -> Iterator[tuple[bytes, int]]:
+        """Yield the text behind the header in blocks of whole lines ended by LF, and each block's first line."""
         line = 1
         for k, (block, passed) in enumerate(self._blocks()):
             skip = self._preamble if k == 0 else 0
             if skip:
-                block = b"\n".join(block.split(b"\n", skip)[skip:])
-            frame = self._parse(block, line + skip, sorted(set(columns)), report)
+                block = block.split(b"\n", skip)[-1]
+            yield block, line + skip
             line += passed
-            if frame.height:
-                yield frame
+
+    def parse(self, block: bytes, line: int, columns: Sequence[int], report: ReportBuilder) -> pl.DataFrame:
+        """Return the rows of one block as :meth:`rows` does; ``line`` is the number of its first line."""
+        return self._parse(block, line, sorted(set(columns)), report)
 
     def _blocks(self) -> Iterator[tuple[bytes, int]]:
         """Yield blocks with LF line ends and one-byte separators, and their number of physical lines."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import polars as pl
 
 from ..recording.errors import MarchaError
@@ -20,6 +22,9 @@ PREAMBLE_LINES = 200
 """A header stands in one of so many first lines."""
 MISSING = ("", "-", "nan", "na", "null", "none", "inf", "-inf")
 """Cells (lower case) that say that there is no value."""
+_MISSING_AS_WRITTEN = ("", "-", "nan", "NaN", "NA", "null", "NULL", "None", "inf", "-inf")
+_COMMA = re.compile(r"^[+-]?\d+,\d+([eE][+-]?\d+)?$")
+_POINT = re.compile(r"^[+-]?\d*\.\d+([eE][+-]?\d+)?$")
 
 
 @dataclass(frozen=True)
@@ -29,7 +34,7 @@ class Header:
     Attributes
     ----------
     line : int
-        Physical line, from 1.
+        Physical line, from 1; 0 for a file that has none, whose columns are known.
     names : tuple of str
         Column names, stripped.
     separator : str
@@ -79,48 +84,167 @@ def require_header(path: Path, accept: Callable[[Sequence[str]], bool], wanted: 
     return header
 
 
-def float_blocks(path: Path, header: Header, required: str, report: ReportBuilder) -> Iterator[pl.DataFrame]:
+def float_blocks(
+    path: Path,
+    header: Header,
+    required: str,
+    report: ReportBuilder,
+    *,
+    integers: Collection[str] = (),
+    texts: Collection[str] = (),
+) -> Iterator[pl.DataFrame]:
     """Yield the rows behind the header: one Float64 column a name, and ``line`` (Int64).
 
-    A cell without a value is NaN, as is one that is no number (a repair, ``missing_cell``). Rows with another
-    number of cells than the header, or without a number in the column ``required``, are dropped as
+    A cell without a value is NaN, as is one that is no number (a repair, ``missing_cell``); one decimal comma in
+    a file of decimal points is repaired (``decimal_comma``), a file of decimal commas is read as such. Rows with
+    another number of cells than the header, or without a number in the column ``required``, are dropped as
     ``bad_row``; blank lines are nothing.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    header : Header
+        Its header.
+    required : str
+        Column without which a row is none.
+    report : ReportBuilder
+        Takes what is found.
+    integers, texts : collection of str
+        Columns that stay whole numbers (Int64: nanoseconds since 1970 need them), and text.
 
     Raises
     ------
     MarchaError
         The file ends with its header, or its rows do not fit it.
     """
-    cells = Cells(path, Layout(separator=header.separator, skip_rows=header.line - 1))
-    if tuple(cells.names) != header.names:
+    headed = header.line > 0
+    cells = Cells(path, Layout(separator=header.separator, skip_rows=max(header.line - 1, 0), header=headed))
+    if not headed and cells.width != len(header.names):
+        raise MarchaError(f"{path}: its first row has {cells.width} cells, not {len(header.names)}")
+    if headed and tuple(cells.names) != header.names:
         raise MarchaError(
             f"{path}, line {header.line}: the header's {len(header.names)} names do not fit the "
             f"{cells.width} cells of the first row; repair the header"
         )
     names = {f"c{i}": name for i, name in enumerate(header.names) if name}
-    for block in cells.rows([int(c[1:]) for c in names], report):
-        block = _with_number(
-            block, next(c for c, name in names.items() if name == required), required, report
+    kinds = {
+        c: pl.String if n in texts else pl.Int64 if n in integers else pl.Float64 for c, n in names.items()
+    }
+    commas: bool | None = None if header.separator != "," else False
+    for block, line in cells.blocks():
+        if commas is None and block:
+            commas = _is_decimal_comma(block, header.separator)
+            if commas:
+                report.note("decimal_comma", "numbers are written with a decimal comma: read so", line=line)
+        if commas:
+            block = block.replace(b",", b".")
+        frame = _plain_block(block, line, header.separator, cells.width, names, kinds, required)
+        if frame is None:
+            text = cells.parse(block, line, [int(c[1:]) for c in names], report)
+            frame = careful_block(text, names, kinds, required, report) if text.height else None
+        if frame is not None and frame.height:
+            yield frame
+
+
+def _is_decimal_comma(block: bytes, separator: str) -> bool:
+    """Whether the first row has numbers with a comma and none with a point."""
+    first = block.split(b"\n", 1)[0].decode("utf-8", "replace").split(separator)
+    return any(_COMMA.fullmatch(c.strip()) for c in first) and not any(
+        _POINT.fullmatch(c.strip()) for c in first
+    )
+
+
+def _plain_block(
+    block: bytes,
+    line: int,
+    separator: str,
+    width: int,
+    names: Mapping[str, str],
+    kinds: Mapping[str, Any],
+    required: str,
+) -> pl.DataFrame | None:
+    """Return a block in which every line is a row and every cell what it should be; None where one is not."""
+    rows = block.count(b"\n") + (not block.endswith(b"\n"))
+    if not block.strip() or block.count(separator.encode()) != rows * (width - 1):
+        return None
+    try:
+        frame = pl.read_csv(
+            block,
+            has_header=False,
+            separator=separator,
+            schema={f"c{i}": kinds.get(f"c{i}", pl.String) for i in range(width)},
+            null_values=list(_MISSING_AS_WRITTEN),
         )
-        columns = {"line": block["line"]}
-        for place, name in names.items():
-            value = _numbers(block[place])
-            columns[name] = value.fill_null(math.nan)
-            if not value.null_count():
+    except pl.exceptions.PolarsError:
+        return None
+    place = next(c for c, name in names.items() if name == required)
+    if frame.height != rows or frame[place].null_count():
+        return None
+    out: dict[str, Any] = {"line": np.arange(line, line + rows)}
+    for c, name in names.items():
+        column = frame[c]
+        if kinds[c] == pl.Float64:
+            column = column.fill_null(math.nan)
+            if column.is_infinite().any() or (c == place and column.is_nan().any()):
+                return None
+        out[name] = column
+    return pl.DataFrame(out)
+
+
+def careful_block(
+    block: pl.DataFrame,
+    names: Mapping[str, str],
+    kinds: Mapping[str, Any],
+    required: str,
+    report: ReportBuilder,
+) -> pl.DataFrame:
+    """Return the rows of a block of text, cell by cell, and report what is no number."""
+    place = next(c for c, name in names.items() if name == required)
+    block = _with_number(block, place, required, report)
+    columns: dict[str, Any] = {"line": block["line"]}
+    for place, name in names.items():
+        if kinds[place] == pl.String:
+            columns[name] = block[place].str.strip_chars()
+            continue
+        if kinds[place] == pl.Int64:
+            columns[name] = block[place].str.strip_chars().cast(pl.Int64, strict=False)
+            if not columns[name].null_count():
                 continue
-            text = block[place].str.strip_chars()
-            given = text.is_not_null() & ~text.str.to_lowercase().is_in(MISSING)
-            odd = given & value.is_null()
-            if odd.any():
-                at = int(odd.arg_true()[0])
-                report.repair(
-                    "missing_cell",
-                    f"{name}: {text[at]!r} is not a number: taken as missing",
-                    count=int(odd.sum()),
-                    line=block["line"][at],
-                    subject=f"{name} unreadable",
-                )
-        yield pl.DataFrame(columns)
+            columns[name] = _numbers(block[place]).round().cast(pl.Int64)
+            continue
+        value = _numbers(block[place])
+        columns[name] = value.fill_null(math.nan)
+        if not value.null_count():
+            continue
+        text = block[place].str.strip_chars()
+        dotted = _numbers(
+            pl.select(pl.when(text.str.contains(_COMMA.pattern)).then(text)).to_series().str.replace(",", ".")
+        )
+        comma = value.is_null() & dotted.is_not_null()
+        if comma.any():
+            at = int(comma.arg_true()[0])
+            report.repair(
+                "decimal_comma",
+                f"{name}: {text[at]!r} is read as {dotted[at]:g}",
+                count=int(comma.sum()),
+                line=block["line"][at],
+                subject=name,
+            )
+            value = value.fill_null(dotted)
+            columns[name] = value.fill_null(math.nan)
+        given = text.is_not_null() & ~text.str.to_lowercase().is_in(MISSING)
+        odd = given & value.is_null()
+        if odd.any():
+            at = int(odd.arg_true()[0])
+            report.repair(
+                "missing_cell",
+                f"{name}: {text[at]!r} is not a number: taken as missing",
+                count=int(odd.sum()),
+                line=block["line"][at],
+                subject=f"{name} unreadable",
+            )
+    return pl.DataFrame(columns)
 
 
 def _numbers(text: pl.Series) -> pl.Series:

@@ -37,6 +37,21 @@ class Rows:
     wall_ms: NDArray[np.int32]
 
 
+def start_of(path: Path, size: int = 4096) -> bytes:
+    """Return the first bytes of a file.
+
+    Raises
+    ------
+    MarchaError
+        Where the file cannot be read.
+    """
+    try:
+        with path.open("rb") as f:
+            return f.read(size)
+    except OSError as error:
+        raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
 def read_blocks(path: Path, size: int = BLOCK_BYTES) -> Iterator[tuple[bytes, bool]]:
     """Yield pieces of a file cut at line ends, and whether a piece is the last.
 

@@ -1,0 +1,178 @@
+"""Simulated phones in the layouts of logger apps: what the tests of importers read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from marcha.ingest.simulate import PhoneWalk, phone_walk
+
+
+def short_walk(**options: Any) -> PhoneWalk:
+    """Return a phone that rests, then is carried 10 m: about 800 samples at 50 Hz."""
+    settings: dict[str, Any] = {"rate_hz": 50, "gnss_hz": 1, "rest_s": 4} | options
+    return phone_walk("phone-10m", **settings)
+
+
+def table(path: Path, header: str, rows: np.ndarray, separator: str = ",", digits: str = "%.10g") -> Path:
+    """Write a table of numbers below a header."""
+    lines = [separator.join(digits % v for v in row) for row in rows]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("\n".join([header, *lines, ""]), encoding="utf-8")
+    return path
+
+
+def seconds(walk: PhoneWalk, t_ns: np.ndarray | None = None) -> np.ndarray:
+    return ((walk.t_ns if t_ns is None else t_ns) - walk.t_ns[0]) / 1e9
+
+
+def fixes(walk: PhoneWalk) -> np.ndarray:
+    """Return t (s), latitude, longitude, height, speed, course, accuracies: phyphox's columns."""
+    f = walk.fixes
+    n = f.height
+    columns = [
+        seconds(walk, f["t_ns"].to_numpy()),
+        *(f[c].to_numpy() for c in ("lat_deg", "lon_deg", "alt_m")),
+    ]
+    accuracy = f["sd_east_m"].to_numpy() * np.sqrt(-2 * np.log(0.32))
+    return np.column_stack([*columns, np.full(n, -1), np.full(n, -1), accuracy, f["sd_up_m"].to_numpy()])
+
+
+def phyphox(folder: Path, walk: PhoneWalk, separator: str = ",") -> Path:
+    """Write phyphox's folder; the header is quoted as the app does."""
+    t = seconds(walk)
+
+    def write(name: str, cells: list[str], rows: np.ndarray) -> None:
+        header = separator.join(f'"{c}"' for c in cells)
+        table(folder / name, header, rows, separator, "%.9E")
+
+    for name, unit, values in (
+        ("Accelerometer", "m/s^2", walk.acc_b),
+        ("Gyroscope", "rad/s", walk.gyr_b),
+        ("Magnetometer", "µT", walk.mag_b * 1e6),
+    ):
+        write(f"{name}.csv", ["Time (s)", *(f"{a} ({unit})" for a in "XYZ")], np.column_stack((t, values)))
+    names = ["Latitude (°)", "Longitude (°)", "Height (m)", "Velocity (m/s)", "Direction (°)"]
+    names += ["Horizontal Accuracy (m)", "Vertical Accuracy (°)"]
+    header = separator.join(f'"{c}"' for c in ["Time (s)", *names])
+    table(folder / "Location.csv", header, fixes(walk), separator, "%.15E")
+    return folder
+
+
+ANDROSENSOR = (
+    *(f"ACCELEROMETER {a} (m/s²)" for a in "XYZ"),
+    *(f"GYROSCOPE {a} (rad/s)" for a in "XYZ"),
+    *(f"MAGNETIC FIELD {a} (μT)" for a in "XYZ"),
+    "LOCATION Latitude : ",
+    "LOCATION Longitude : ",
+    "LOCATION Altitude ( m)",
+    "LOCATION Accuracy ( m)",
+    "Time since start in ms ",
+    "YYYY-MO-DD HH-MI-SS_SSS",
+)
+
+
+def held_fixes(walk: PhoneWalk) -> np.ndarray:
+    """Return latitude, longitude, height and accuracy on every sample: the last one so far, NaN before the first."""
+    f = fixes(walk)
+    at = np.searchsorted(walk.fixes["t_ns"].to_numpy(), walk.t_ns, side="right") - 1
+    out = f[np.maximum(at, 0)][:, [1, 2, 3, 6]]
+    out[at < 0] = np.nan
+    return out
+
+
+def androsensor(path: Path, walk: PhoneWalk) -> Path:
+    """Write AndroSensor's table: empty cells before the first fix, milliseconds behind a colon."""
+    rows = np.hstack((walk.acc_b, walk.gyr_b, walk.mag_b * 1e6, held_fixes(walk)))
+    ms = np.round(seconds(walk) * 1e3).astype(int)
+    lines = [",".join(ANDROSENSOR)]
+    for row, t in zip(rows, ms, strict=True):
+        cells = ["" if np.isnan(v) else f"{v:.10g}" for v in row]
+        wall = f"2026-03-09 08:51:{47 + t // 1000:02d}:{t % 1000:03d}"
+        lines.append(",".join([*cells, str(t), wall]))
+    path.write_text("\n".join(lines), encoding="utf-8")
+    return path
+
+
+SENSORTESTER = (
+    "TimeStamp[ms];Prox[Cm];AccX[m/s^2];AccY[m/s^2];AccZ[m/s^2];GyroX[rad/s];GyroY[rad/s];GyroZ[rad/s];"
+    "MagnX[uT];MagnY[uT];MagnZ[uT];Press[Pa];Lat;Lng"
+)
+
+
+def sensortester(path: Path, walk: PhoneWalk) -> Path:
+    """Write SensorTester's table: hPa under a header of Pa, ``-`` where there is nothing."""
+    place = held_fixes(walk)
+    lines = [SENSORTESTER]
+    for k, t in enumerate(walk.t_ns // 1_000_000):
+        values = [*walk.acc_b[k], *walk.gyr_b[k], *walk.mag_b[k] * 1e6, 938.2 + k // 20 * 0.01, *place[k, :2]]
+        lines.append(";".join([str(t), "-", *("-" if np.isnan(v) else f"{v:.10g}" for v in values)]))
+    path.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    return path
+
+
+def indoor_location(path: Path, walk: PhoneWalk) -> Path:
+    """Write rows of the indoor-location apps, a signal out of order, waypoints at both ends."""
+    ms = walk.t_ns // 1_000_000
+    quat = np.where(walk.quat_wxyz[:, :1] < 0, -walk.quat_wxyz, walk.quat_wxyz)
+    rows = ["#\tstartTime:1", "#\tSiteName:Mall\tFloorName:F1", "#\tBrand:Acme\tModel:One\t"]
+    rows.append(f"{ms[0]}\tTYPE_WAYPOINT\t143.9522\t85.64752")
+    for k, t in enumerate(ms):
+        for kind, values in (
+            ("ACCELEROMETER", walk.acc_b[k]),
+            ("GYROSCOPE", walk.gyr_b[k]),
+            ("MAGNETIC_FIELD", walk.mag_b[k] * 1e6),
+            ("ROTATION_VECTOR", quat[k, 1:]),
+        ):
+            rows.append("\t".join([str(t), f"TYPE_{kind}", *(f"{v:.9g}" for v in values), "3"]))
+        if k % 100 == 50:
+            rows.append(f"{t}\tTYPE_WIFI\tguest\t16:74:9C:2B:4D:1B\t-41\t5825\t{t - 300}")
+            rows.append(f"{t - 40}\tTYPE_BEACON\t9195B3AD\t0\t0\t-56\t-89\t32.1\tE0:78:A3:3D:B5:AB\t{t}")
+            rows.append(f"{t}\tTYPE_BLUE\tw36\tE0:78:A3:3D:B5:AB\t-89")
+    rows.append(f"{ms[-1]}\tTYPE_WAYPOINT\t137.1\t88.0")
+    path.write_text("\n".join([*rows, ""]), encoding="utf-8")
+    return path
+
+
+def android_ns(folder: Path, walk: PhoneWalk) -> Path:
+    """Write a folder of sensor events and of two feet's contacts."""
+    folder.mkdir(parents=True, exist_ok=True)
+    boot = 263_415_142_248_209
+    t = walk.t_ns - walk.t_ns[0] + boot
+    for name, values in (("accelerometer", walk.acc_b), ("gyroscope", walk.gyr_b)):
+        rows = (f"{a},3," + ",".join(f"{v:.9g}" for v in row) for a, row in zip(t, values, strict=True))
+        (folder / f"{name}.csv").write_text("\r\n".join(rows) + "\r\n")
+    down = walk.steps["end_ns"].to_numpy() - walk.t_ns[0] + boot
+    grid = np.arange(t[0], t[-1], 97_000_000)
+    feet = np.stack([_on_ground(grid, down[k::2]) for k in (0, 1)])
+    (folder / "stepcounter.csv").write_text(
+        "\n".join(f"{g},{a},{b}" for g, a, b in zip(grid, *feet, strict=True))
+    )
+    (folder / "metadata.txt").write_text("accelerometer : MPU6515 Accelerometer\n")
+    return folder
+
+
+def _on_ground(grid: np.ndarray, contacts: np.ndarray) -> np.ndarray:
+    """1 for 0.6 s from every contact of a foot."""
+    since = grid - contacts[np.maximum(np.searchsorted(contacts, grid, side="right") - 1, 0)]
+    return ((since >= 0) & (since < 600_000_000)).astype(int)
+
+
+def rtk_pos(path: Path, walk: PhoneWalk) -> Path:
+    """Write the true track as a survey in degrees, minutes and seconds."""
+    stamps = walk.t_ns[::5].astype("datetime64[ns]")
+    metre = 1 / 111_000
+    rows = ["YEAR-MM-DD HR:MN:SS.SSS  LAT(d) LAT(m) LAT(s) LON(d)   LON(m)LON(s)        HGT(m)"]
+    for at, pos in zip(stamps, walk.pos[::5], strict=True):
+        cells = []
+        for value in (walk.options.lat_deg + pos[1] * metre, walk.options.lon_deg + pos[0] * metre):
+            size = abs(value)
+            minutes = (size - int(size)) * 60
+            cells.append(
+                f"{'-' if value < 0 else ''}{int(size)} {int(minutes)} {(minutes - int(minutes)) * 60:.5f}"
+            )
+        date, time = str(at)[:23].split("T")
+        rows.append(f"{date} {time}   {cells[0]}   {cells[1]}   {walk.options.alt_m + pos[2]:.3f}")
+    path.write_text("\r\n".join([*rows, ""]))
+    return path
