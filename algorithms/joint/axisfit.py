@@ -313,35 +313,25 @@ def fit_axes(
             for i in range(2):
                 for m in range(3):
                     w.best[i, m] = w.axis[i, m]
-    sign = 1.0 if w.best[0, 0] * ox + w.best[0, 1] * oy + w.best[0, 2] * oz >= 0.0 else -1.0
     for i in range(2):
         for m in range(3):
-            w.axis[i, m] = sign * w.best[i, m]
-    if sd_acc > 0.0:
-        # Both pairings are carried to the end of the joint cost; the smaller misfit of the angles wins.
-        plus = descend_axes(w, rows, count, sd_gyr, sd_acc, gravity, 25)
-        fit_plus = pairing_misfit(w, rows, count, lag, 1.0)
-        for i in range(2):
+            w.axis[i, m] = w.best[i, m]
+    # The pairing whose angles agree better (eqs 73, 74) is carried to the end of the joint cost; there the two
+    # are compared again, now with better axes.
+    for again in range(2):
+        plus = pairing_misfit(w, rows, count, lag, 1.0)
+        minus = pairing_misfit(w, rows, count, lag, -1.0)
+        known = math.isfinite(plus) and math.isfinite(minus)
+        if known and minus < plus:
             for m in range(3):
-                w.best[i, m], w.axis[i, m] = w.axis[i, m], (sign if i == 0 else -sign) * w.best[i, m]
-        minus = descend_axes(w, rows, count, sd_gyr, sd_acc, gravity, 25)
-        fit_minus = pairing_misfit(w, rows, count, lag, 1.0)
-    else:
-        plus, minus = least, least
-        fit_plus = pairing_misfit(w, rows, count, lag, 1.0)
-        fit_minus = pairing_misfit(w, rows, count, lag, -1.0)
-        for i in range(2):
-            for m in range(3):
-                w.best[i, m] = w.axis[i, m]
-                if i == 1:
-                    w.axis[i, m] = -w.axis[i, m]
-    known = math.isfinite(fit_plus) and math.isfinite(fit_minus)
-    w.pairing = max(fit_plus, fit_minus) / (fit_plus + fit_minus) if known else 0.5
-    better = fit_plus <= fit_minus if known else plus <= minus
-    if better:
-        for i in range(2):
-            for m in range(3):
-                w.axis[i, m] = w.best[i, m]
+                w.axis[1, m] = -w.axis[1, m]
+        w.pairing = max(plus, minus) / (plus + minus) if known else 0.5
+        if again == 0 and sd_acc > 0.0:
+            descend_axes(w, rows, count, sd_gyr, sd_acc, gravity, 25)
+    sign = 1.0 if w.axis[0, 0] * ox + w.axis[0, 1] * oy + w.axis[0, 2] * oz >= 0.0 else -1.0
+    for i in range(2):
+        for m in range(3):
+            w.axis[i, m] *= sign
     w.cost = axes_cost(w, rows, count, sd_gyr, sd_acc, gravity, True)
     spread(w, rows, count)
     return known

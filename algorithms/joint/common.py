@@ -101,10 +101,13 @@ def per_segment(text: str, segment: str) -> str:
 
 def mount_of(axis: FloatArray, up: FloatArray | None) -> FloatArray:
     """Return the rotation from sensor to segment, rows x = flexion axis, y, z = long axis made square to it."""
-    if up is None:
-        along = np.abs(axis).max() > 0.999
-        up = np.abs(np.roll(axis, 2)) if along else np.eye(3)[int(np.argmin(np.abs(axis)))]
-    z = up - (up @ axis) * axis
+    if up is not None:
+        long = up
+    elif np.abs(axis).max() > 0.999:
+        long = np.abs(np.roll(axis, 2))
+    else:
+        long = np.eye(3)[int(np.argmin(np.abs(axis)))]
+    z = long - (long @ axis) * axis
     if np.linalg.norm(z) < 0.1:
         raise AlgorithmError("up lies along axis; they must be two directions at least 6° apart")
     z = z / np.linalg.norm(z)

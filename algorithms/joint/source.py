@@ -342,14 +342,16 @@ class JointSmea(SourceFilter):
         s["alpha_r"] = p.sigma2_alpha
         s["alpha_q"] = p.sigma2_gyr, p.sigma2_bias
         s["alpha_decay"] = 1.0 / p.tau_s
-        lay_axes(s, p, self.segments, context)
+        lay_axes(s, p, self.segments, context, p.sd_gyr, p.sd_acc)
 
     def remarks(self) -> list[Remark]:
         """Say whether the axes are known."""
         return super().remarks() + axis_remarks(self.state[0], self.segments)
 
 
-def lay_axes(s: Any, p: Any, segments: tuple[str, ...], context: Context) -> None:
+def lay_axes(
+    s: Any, p: Any, segments: tuple[str, ...], context: Context, sd_gyr: float, sd_acc: float
+) -> None:
     """Write axes, positions and the identification's settings into a packed state with its mountings laid."""
     flex = int(s["flex"]) if "flex" in s.dtype.names else 0
     s["given_axis"] = s["mount"][:2, flex]
@@ -357,7 +359,7 @@ def lay_axes(s: Any, p: Any, segments: tuple[str, ...], context: Context) -> Non
     s["up"] = s["mount"][:2, 2]
     s["learn"] = ("off", "axes", "position").index(p.identify)
     s["stride"], s["fit_at"] = 1, 2.0
-    s["sd_gyr"], s["sd_acc"], s["gravity"] = p.sd_gyr, p.sd_acc, p.gravity
+    s["sd_gyr"], s["sd_acc"], s["gravity"] = sd_gyr, sd_acc, p.gravity
     s["known"] = s["learn"] == 0
     calibration = context.calibrations.get("joint")
     if calibration is not None and calibration.usable and "hinges" in calibration.values:
@@ -373,13 +375,13 @@ def lay_axes(s: Any, p: Any, segments: tuple[str, ...], context: Context) -> Non
     selfaligned.set_base(s)
 
 
-def axis_remarks(s: Any, segments: tuple[str, ...]) -> list[Remark]:
-    """Say whether the identified axes may be used."""
+def axis_remarks(s: Any, segments: tuple[str, ...], fatal: bool = True) -> list[Remark]:
+    """Say whether the identified axes may be used; ``fatal`` where nothing else gives the angle."""
     if s["learn"] == 0:
         return []
     if not s["fits"]:
         return [
-            Remark("axis_unknown", "too short to find the hinge axes: at least 2 s of motion", fatal=True)
+            Remark("axis_unknown", "too short to find the hinge axes: at least 2 s of motion", fatal=fatal)
         ]
     sd = np.degrees(s["axis_sd"])
     if s["known"]:
@@ -402,6 +404,6 @@ def axis_remarks(s: Any, segments: tuple[str, ...]) -> list[Remark]:
         Remark(
             "not_observable",
             f"hinge axes are not observable: {why}; give them by axis, or calibrate on motion of both segments",
-            fatal=True,
+            fatal=fatal,
         )
     ]

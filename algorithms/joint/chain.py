@@ -1,0 +1,524 @@
+"""Kernel of the orientations of a chain of segments: error-state Kalman filter with the joints as measurements.
+
+Per segment a rotation rot_nb (sensor to navigation frame, z up) and a gyroscope bias; error states φ (rotation
+about the navigation axes, R_true = exp([φ]×) R) and δb. Attitude is carried by the turn since the sample before.
+
+Measurements, every sample:
+
+* gravity, each segment: R f = [0, 0, g] + a, f = a_sensor − Γ(o) at the joint's centre. The acceleration a is taken
+  for coloured noise of standard deviation ``sd_force`` and correlation time ``tau_force``: as white noise at the
+  sample time T its variance is 2 sd² τ / T, so the result does not depend on the rate. It grows with |‖f‖ − g|.
+* connection, each joint with known position: R_u f_u = R_l f_l, the acceleration of the joint's centre is the same
+  for both (Kok et al. 2014; Weygers and Kok 2020). This makes relative heading observable under motion.
+* hinge: R_u j_u = R_l j_l; two axes: (R_u j_u)·(R_l j_l) = cos of their constant angle. Sway of soft tissue is
+  coloured noise of ``sway`` and ``tau_sway``.
+* rest: where force and rate are steady, the rate is the bias.
+
+The common heading of all segments is not observable and is not corrected.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ..contract import FloatArray, IntArray
+from ..numerics.compiled import compiled
+from . import merge, selfaligned
+from .selfaligned import near
+
+HINGE, TWO, FREE = 0, 1, 2
+MOST = merge.MOST
+STATES = 6 * MOST
+JOINTS = MOST - 1
+
+DTYPE = np.dtype(
+    [
+        *merge.FIELDS,
+        *selfaligned.FIELDS,
+        ("mount", "f8", (MOST, 3, 3)),
+        ("type", "i8", (JOINTS,)),
+        ("j", "f8", (JOINTS, 2, 3)),
+        ("lever", "f8", (JOINTS, 2, 3)),
+        ("placed", "i8", (JOINTS,)),
+        ("cosine", "f8", (JOINTS,)),
+        ("anchor", "f8", (3,)),
+        ("anchored", "i8"),
+        ("on_line", "i8"),
+        ("q_gyr", "f8"),
+        ("q_bias", "f8"),
+        ("p_bias", "f8"),
+        ("r_force", "f8"),  # 2 sd² τ
+        ("k_force", "f8"),
+        ("r_joint", "f8"),
+        ("k_joint", "f8"),
+        ("r_sway", "f8"),
+        ("r_rest", "f8"),
+        ("rot", "f8", (MOST, 3, 3)),
+        ("bias", "f8", (MOST, 3)),
+        ("f", "f8", (MOST, 3)),  # force of the gravity row in the navigation frame
+        ("low", "f8", (MOST, 6)),
+        ("still", "f8", (MOST,)),
+        ("x", "f8", (STATES,)),
+        ("P", "f8", (STATES, STATES)),
+        ("at", "i8", (6,)),
+        ("h", "f8", (6,)),
+        ("Ph", "f8", (STATES,)),
+        ("u", "f8", (3,)),
+        ("v", "f8", (3,)),
+        ("dev", "f8", (2,)),
+        ("flexion", "f8", (JOINTS,)),
+        ("angle", "f8", (JOINTS, 3)),
+        ("angle_sd", "f8", (JOINTS,)),
+        ("steps", "i8"),
+        ("misfit", "f8"),  # of the connection, running mean square over its variance
+    ]
+)
+
+
+@compiled
+def turn(s: Any, i: int, a: float, b: float, c: float, right: bool) -> None:
+    """Multiply ``s.rot[i]`` by exp([a b c]×) from the right (body) or left."""
+    size = math.sqrt(a * a + b * b + c * c)
+    f = math.sin(size) / size if size > 1e-9 else 1.0
+    h = (1.0 - math.cos(size)) / (size * size) if size > 1e-9 else 0.5
+    e00, e01, e02 = 1.0 - h * (b * b + c * c), h * a * b - f * c, h * a * c + f * b
+    e10, e11, e12 = h * a * b + f * c, 1.0 - h * (a * a + c * c), h * b * c - f * a
+    e20, e21, e22 = h * a * c - f * b, h * b * c + f * a, 1.0 - h * (a * a + b * b)
+    r = s.rot
+    for k in range(3):
+        if right:
+            x, y, z = r[i, k, 0], r[i, k, 1], r[i, k, 2]
+            r[i, k, 0] = x * e00 + y * e10 + z * e20
+            r[i, k, 1] = x * e01 + y * e11 + z * e21
+            r[i, k, 2] = x * e02 + y * e12 + z * e22
+        else:
+            x, y, z = r[i, 0, k], r[i, 1, k], r[i, 2, k]
+            r[i, 0, k] = e00 * x + e01 * y + e02 * z
+            r[i, 1, k] = e10 * x + e11 * y + e12 * z
+            r[i, 2, k] = e20 * x + e21 * y + e22 * z
+
+
+@compiled
+def square(s: Any, i: int) -> None:
+    """Take rounding out of ``s.rot[i]``: Gram-Schmidt on its rows."""
+    r = s.rot
+    for k in range(2):
+        size = math.sqrt(r[i, k, 0] ** 2 + r[i, k, 1] ** 2 + r[i, k, 2] ** 2)
+        for m in range(3):
+            r[i, k, m] /= size
+        if k == 0:
+            dot = r[i, 0, 0] * r[i, 1, 0] + r[i, 0, 1] * r[i, 1, 1] + r[i, 0, 2] * r[i, 1, 2]
+            for m in range(3):
+                r[i, 1, m] -= dot * r[i, 0, m]
+    r[i, 2, 0] = r[i, 0, 1] * r[i, 1, 2] - r[i, 0, 2] * r[i, 1, 1]
+    r[i, 2, 1] = r[i, 0, 2] * r[i, 1, 0] - r[i, 0, 0] * r[i, 1, 2]
+    r[i, 2, 2] = r[i, 0, 0] * r[i, 1, 1] - r[i, 0, 1] * r[i, 1, 0]
+
+
+@compiled
+def restart(s: Any, i: int) -> None:
+    """Begin segment ``i``: tilt by its accelerometer, flexion axis along x (or the neighbour's) of the frame."""
+    n = 6 * s.n
+    a = s.acc[i]
+    size = math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
+    ux, uy, uz = a[0] / size, a[1] / size, a[2] / size
+    jx, jy, jz = s.mount[i, 0, 0], s.mount[i, 0, 1], s.mount[i, 0, 2]
+    dot = ux * jx + uy * jy + uz * jz
+    known = abs(dot) < 0.9
+    if not known:  # flexion axis near the vertical: the long axis instead, forward
+        jx, jy, jz = s.mount[i, 1, 0], s.mount[i, 1, 1], s.mount[i, 1, 2]
+        dot = ux * jx + uy * jy + uz * jz
+    jx, jy, jz = jx - dot * ux, jy - dot * uy, jz - dot * uz
+    size = math.sqrt(jx * jx + jy * jy + jz * jz)
+    jx, jy, jz = jx / size, jy / size, jz / size
+    kx, ky, kz = uy * jz - uz * jy, uz * jx - ux * jz, ux * jy - uy * jx
+    r = s.rot
+    first = 0 if known else 1
+    sign = 1.0 if known else -1.0
+    r[i, first, 0], r[i, first, 1], r[i, first, 2] = jx, jy, jz
+    r[i, 1 - first, 0], r[i, 1 - first, 1], r[i, 1 - first, 2] = sign * kx, sign * ky, sign * kz
+    r[i, 2, 0], r[i, 2, 1], r[i, 2, 2] = ux, uy, uz
+    other = i - 1 if i > 0 else 1
+    if s.on_line == 1 and s.n > 1 and s.valid[other] == 1 and s.type[min(i, other)] != TWO:
+        # Heading of the joint's axis from the neighbour.
+        k = min(i, other)
+        mine, its = (0, 1) if i == k else (1, 0)
+        wx, wy, vx, vy = 0.0, 0.0, 0.0, 0.0
+        for m in range(3):
+            wx += r[other, 0, m] * s.j[k, its, m]
+            wy += r[other, 1, m] * s.j[k, its, m]
+            vx += r[i, 0, m] * s.j[k, mine, m]
+            vy += r[i, 1, m] * s.j[k, mine, m]
+        turn(s, i, 0.0, 0.0, math.atan2(vx * wy - vy * wx, vx * wx + vy * wy), False)
+    for a0 in range(6 * i, 6 * i + 6):
+        for b0 in range(n):
+            s.P[a0, b0] = 0.0
+            s.P[b0, a0] = 0.0
+    for k in range(3):
+        s.P[6 * i + k, 6 * i + k] = 0.02
+        s.P[6 * i + 3 + k, 6 * i + 3 + k] = s.p_bias
+        s.bias[i, k] = 0.0
+    hinge = s.n > 1 and s.type[max(0, i - 1)] == HINGE
+    s.P[6 * i + 2, 6 * i + 2] = 0.02 if hinge and known else 0.3
+    s.still[i] = 0.0
+    for k in range(3):
+        s.low[i, k] = s.acc[i, k]
+        s.low[i, 3 + k] = s.gyr[i, k]
+
+
+@compiled
+def predict(s: Any) -> None:
+    """Carry attitudes and P: φ ← φ − R δb T."""
+    n, t = 6 * s.n, s.dt
+    for i in range(s.n):
+        if s.valid[i] == 1:
+            b = s.bias[i]
+            turn(s, i, s.turn[i, 0] - t * b[0], s.turn[i, 1] - t * b[1], s.turn[i, 2] - t * b[2], True)
+        a = 6 * i
+        for c in range(n):
+            x, y, z = s.P[a + 3, c], s.P[a + 4, c], s.P[a + 5, c]
+            for k in range(3):
+                s.P[a + k, c] -= t * (s.rot[i, k, 0] * x + s.rot[i, k, 1] * y + s.rot[i, k, 2] * z)
+        for c in range(n):
+            x, y, z = s.P[c, a + 3], s.P[c, a + 4], s.P[c, a + 5]
+            for k in range(3):
+                s.P[c, a + k] -= t * (s.rot[i, k, 0] * x + s.rot[i, k, 1] * y + s.rot[i, k, 2] * z)
+        for k in range(3):
+            s.P[a + k, a + k] += s.q_gyr * t
+            s.P[a + 3 + k, a + 3 + k] += s.q_bias * t
+
+
+@compiled
+def take(s: Any, count: int, e: float, r: float) -> None:
+    """Take one scalar measurement: residual ``e`` before any of this sample's, entries ``s.h`` at ``s.at``."""
+    n = 6 * s.n
+    total = r
+    for a in range(n):
+        p = 0.0
+        for k in range(count):
+            p += s.P[a, s.at[k]] * s.h[k]
+        s.Ph[a] = p
+    for k in range(count):
+        total += s.h[k] * s.Ph[s.at[k]]
+        e -= s.h[k] * s.x[s.at[k]]
+    for a in range(n):
+        g = s.Ph[a] / total
+        s.x[a] += g * e
+        for b in range(a, n):
+            p = s.P[a, b] - g * s.Ph[b]
+            s.P[a, b] = p
+            s.P[b, a] = p
+
+
+@compiled
+def to_nav(s: Any, i: int, x: float, y: float, z: float, out: FloatArray) -> None:
+    """Write ``rot[i] @ [x, y, z]`` to ``out``."""
+    for k in range(3):
+        out[k] = s.rot[i, k, 0] * x + s.rot[i, k, 1] * y + s.rot[i, k, 2] * z
+
+
+@compiled
+def force_at(s: Any, i: int, o: FloatArray, out: FloatArray) -> float:
+    """Write the force at the point whose vector to the sensor is ``o``, in the navigation frame; return ‖Γ‖."""
+    gx = s.gyr[i, 0] - s.bias[i, 0]
+    gy = s.gyr[i, 1] - s.bias[i, 1]
+    gz = s.gyr[i, 2] - s.bias[i, 2]
+    along = gx * o[0] + gy * o[1] + gz * o[2]
+    size = gx * gx + gy * gy + gz * gz
+    cx = gx * along - o[0] * size + s.dgyr[i, 1] * o[2] - s.dgyr[i, 2] * o[1]
+    cy = gy * along - o[1] * size + s.dgyr[i, 2] * o[0] - s.dgyr[i, 0] * o[2]
+    cz = gz * along - o[2] * size + s.dgyr[i, 0] * o[1] - s.dgyr[i, 1] * o[0]
+    to_nav(s, i, s.acc[i, 0] - cx, s.acc[i, 1] - cy, s.acc[i, 2] - cz, out)
+    return math.sqrt(cx * cx + cy * cy + cz * cz)
+
+
+@compiled
+def cross_row(s: Any, first: int, i: int, v: FloatArray, k: int, sign: float) -> None:
+    """Write the entries of ∂(sign·v)_k/∂φ_i, v turned by φ: −sign [v]× row k, to places ``first`` … + 2."""
+    a, b = (k + 1) % 3, (k + 2) % 3
+    # (φ × v)_k = φ_a v_b − φ_b v_a
+    s.at[first], s.at[first + 1], s.at[first + 2] = 6 * i + k, 6 * i + a, 6 * i + b
+    s.h[first], s.h[first + 1], s.h[first + 2] = 0.0, sign * v[b], -sign * v[a]
+
+
+@compiled
+def gravity(s: Any) -> None:
+    """Rows of gravity, one pair a segment."""
+    for i in range(s.n):
+        if s.valid[i] == 0:
+            continue
+        if i == 0 and s.anchored == 1:
+            moved = force_at(s, i, s.anchor, s.u)
+        elif s.n > 1:
+            k, side = (i - 1, 1) if i > 0 else (0, 0)
+            moved = force_at(s, i, s.lever[k, side], s.u)
+        else:
+            to_nav(s, i, s.acc[i, 0], s.acc[i, 1], s.acc[i, 2], s.u)
+            moved = 0.0
+        off = abs(math.sqrt(s.u[0] ** 2 + s.u[1] ** 2 + s.u[2] ** 2) - s.gravity)
+        r = s.r_force
+        if i == 0 and s.anchored == 1:  # the point does not move
+            r = s.r_joint + s.k_joint * moved * moved
+        else:
+            r = (r + s.k_force * off * off) * s.n
+        r /= max(1e-4, s.dt)
+        for k in range(2):
+            cross_row(s, 0, i, s.u, k, 1.0)
+            take(s, 3, -s.u[k], r)
+
+
+@compiled
+def connect(s: Any, j: int) -> None:
+    """Rows of joint ``j``: the centre's acceleration and the axes."""
+    if s.placed[j] == 1 and s.slope[j] == 1 and s.slope[j + 1] == 1:
+        moved = force_at(s, j, s.lever[j, 0], s.u) + force_at(s, j + 1, s.lever[j, 1], s.v)
+        r = (s.r_joint + s.k_joint * moved * moved) / max(1e-4, s.dt)
+        for k in range(3):
+            cross_row(s, 0, j, s.u, k, 1.0)
+            cross_row(s, 3, j + 1, s.v, k, -1.0)
+            e = s.v[k] - s.u[k]
+            s.misfit += 0.001 * (e * e / r - s.misfit)
+            take(s, 6, e, r)
+    r = s.r_sway / max(1e-4, s.dt)
+    if s.type[j] == FREE:
+        return
+    a, b = s.j[j, 0], s.j[j, 1]
+    to_nav(s, j, a[0], a[1], a[2], s.u)
+    to_nav(s, j + 1, b[0], b[1], b[2], s.v)
+    if s.type[j] == HINGE:
+        for k in range(3):
+            cross_row(s, 0, j, s.u, k, 1.0)
+            cross_row(s, 3, j + 1, s.v, k, -1.0)
+            take(s, 6, s.v[k] - s.u[k], r)
+        return
+    # u·v = cosine: ∂/∂φ_u = u × v, ∂/∂φ_l = −u × v.
+    u, v = s.u, s.v
+    dot = u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+    for k in range(3):
+        a0, b0 = (k + 1) % 3, (k + 2) % 3
+        c = u[a0] * v[b0] - u[b0] * v[a0]
+        s.at[k], s.h[k] = 6 * j + k, c
+        s.at[3 + k], s.h[3 + k] = 6 * (j + 1) + k, -c
+    take(s, 6, s.cosine[j] - dot, r)
+
+
+@compiled
+def rest(s: Any, i: int) -> None:
+    """Where segment ``i`` has been steady for a second, its rate is the bias."""
+    w = min(1.0, s.dt / 0.5)
+    da, dg, size = 0.0, 0.0, 0.0
+    for k in range(3):
+        da += (s.acc[i, k] - s.low[i, k]) ** 2
+        dg += (s.gyr[i, k] - s.low[i, 3 + k]) ** 2
+        s.low[i, k] += w * (s.acc[i, k] - s.low[i, k])
+        s.low[i, 3 + k] += w * (s.gyr[i, k] - s.low[i, 3 + k])
+        size += (s.low[i, 3 + k] - s.bias[i, k]) ** 2
+    steady = da < 0.09 and dg < 0.0012 and size < 0.0025 + 4.0 * s.p_bias
+    s.still[i] = s.still[i] + s.dt if steady else 0.0
+    if s.still[i] < 1.0:
+        return
+    for k in range(3):
+        s.at[0], s.h[0] = 6 * i + 3 + k, 1.0
+        take(s, 1, s.low[i, 3 + k] - s.bias[i, k], s.r_rest / max(1e-4, s.dt))
+
+
+@compiled
+def feed_back(s: Any) -> None:
+    """Take the corrections into attitudes and biases."""
+    for i in range(s.n):
+        a = 6 * i
+        turn(s, i, s.x[a], s.x[a + 1], s.x[a + 2], False)
+        square(s, i)
+        for k in range(3):
+            s.bias[i, k] += s.x[a + 3 + k]
+    for a in range(6 * s.n):
+        s.x[a] = 0.0
+
+
+@compiled
+def measure_angles(s: Any) -> None:
+    """Write the angles of every joint and the standard deviation of its flexion."""
+    for j in range(s.n - 1):
+        u, w = s.rot[j], s.rot[j + 1]
+        m, o = s.mount[j], s.mount[j + 1]
+        c00, c01, c02, c12, c22 = 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(3):
+            # Axes of both segments in the navigation frame, component k.
+            ux = u[k, 0] * m[0, 0] + u[k, 1] * m[0, 1] + u[k, 2] * m[0, 2]
+            uy = u[k, 0] * m[1, 0] + u[k, 1] * m[1, 1] + u[k, 2] * m[1, 2]
+            uz = u[k, 0] * m[2, 0] + u[k, 1] * m[2, 1] + u[k, 2] * m[2, 2]
+            lx = w[k, 0] * o[0, 0] + w[k, 1] * o[0, 1] + w[k, 2] * o[0, 2]
+            ly = w[k, 0] * o[1, 0] + w[k, 1] * o[1, 1] + w[k, 2] * o[1, 2]
+            lz = w[k, 0] * o[2, 0] + w[k, 1] * o[2, 1] + w[k, 2] * o[2, 2]
+            c00 += lx * ux
+            c01 += lx * uy
+            c02 += lx * uz
+            c12 += ly * uz
+            c22 += lz * uz
+        s.angle[j, 0] = near(math.atan2(-c12, c22), s.angle[j, 0])
+        s.angle[j, 1] = math.asin(max(-1.0, min(1.0, c02)))
+        s.angle[j, 2] = math.atan2(-c01, c00)
+        to_nav(s, j + 1, o[0, 0], o[0, 1], o[0, 2], s.u)
+        total = 0.0
+        for a in range(3):
+            for b in range(3):
+                p, q = 6 * j, 6 * j + 6
+                v = s.P[p + a, p + b] + s.P[q + a, q + b] - s.P[p + a, q + b] - s.P[q + a, p + b]
+                total += s.u[a] * s.u[b] * v
+        s.angle_sd[j] = math.sqrt(max(0.0, total))
+
+
+@compiled
+def set_axes(s: Any) -> None:
+    """Take the identified axes and position of the first joint; turn both mountings to the axes."""
+    for i in range(2):
+        dot, size = 0.0, 0.0
+        for m in range(3):
+            s.j[0, i, m] = s.axis[i, m]
+            s.lever[0, i, m] = s.pos[i, m]
+            dot += s.up[i, m] * s.axis[i, m]
+        for m in range(3):
+            s.mount[i, 0, m] = s.axis[i, m]
+            s.mount[i, 2, m] = s.up[i, m] - dot * s.axis[i, m]
+            size += s.mount[i, 2, m] ** 2
+        size = math.sqrt(size)
+        for m in range(3):
+            s.mount[i, 2, m] /= size
+        for m in range(3):
+            p, q = (m + 1) % 3, (m + 2) % 3
+            s.mount[i, 1, m] = s.mount[i, 2, p] * s.mount[i, 0, q] - s.mount[i, 2, q] * s.mount[i, 0, p]
+    s.placed[0] = 1 if s.learn == 2 and s.pos_sd < 0.05 else 0
+
+
+@compiled
+def step(s: Any) -> bool:
+    """Filter the sample given out; False before every segment was seen once."""
+    if s.on_line == 0:
+        for i in range(s.n):
+            if s.valid[i] == 0:
+                return False
+        for i in range(s.n):
+            restart(s, i)
+        s.on_line = 1
+        return True
+    if s.learn > 0 and s.n > 1 and selfaligned.watch(s) and s.known == 1:
+        set_axes(s)
+    predict(s)
+    for i in range(s.n):
+        if s.valid[i] == 1 and s.gap[i] > 0.0:
+            restart(s, i)
+    gravity(s)
+    for j in range(s.n - 1):
+        if s.valid[j] == 1 and s.valid[j + 1] == 1:
+            connect(s, j)
+    for i in range(s.n):
+        if s.valid[i] == 1:
+            rest(s, i)
+    feed_back(s)
+    s.steps += 1
+    return True
+
+
+@compiled
+def quaternion(r: FloatArray, out: FloatArray, at: int) -> None:
+    """Write the quaternion (wxyz, w ≥ 0) of a rotation; Shepperd's method."""
+    a, b, c = r[0, 0], r[1, 1], r[2, 2]
+    trace = a + b + c
+    if trace > a and trace > b and trace > c:
+        w, x, y, z = 1.0 + trace, r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    elif a > b and a > c:
+        w, x, y, z = r[2, 1] - r[1, 2], 1.0 + a - b - c, r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]
+    elif b > c:
+        w, x, y, z = r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1.0 - a + b - c, r[1, 2] + r[2, 1]
+    else:
+        w, x, y, z = r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1.0 - a - b + c
+    k = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    k = -k if w < 0.0 else k
+    out[at], out[at + 1], out[at + 2], out[at + 3] = w * k, x * k, y * k, z * k
+
+
+@compiled
+def emit(s: Any, out: FloatArray) -> None:
+    """Write: orientations, joint angles, standard deviations, biases, axes of the first joint."""
+    for c in range(out.shape[0]):
+        out[c] = math.nan
+    measure_angles(s)
+    at = 0
+    for i in range(s.n):
+        if s.valid[i] == 1:
+            quaternion(s.rot[i], out, at)
+        at += 4
+    for j in range(s.n - 1):
+        both = s.valid[j] == 1 and s.valid[j + 1] == 1
+        for k in range(1 if s.type[j] == HINGE else 3):
+            if both:
+                out[at] = s.angle[j, k]
+            at += 1
+    for j in range(s.n - 1):
+        if s.valid[j] == 1 and s.valid[j + 1] == 1:
+            out[at] = s.angle_sd[j]
+        at += 1
+    for i in range(s.n):
+        if s.valid[i] == 1:
+            out[at] = math.sqrt(max(0.0, 0.5 * (s.P[6 * i, 6 * i] + s.P[6 * i + 1, 6 * i + 1])))
+        at += 1
+    for i in range(s.n):
+        for k in range(3):
+            if s.valid[i] == 1:
+                out[at] = s.bias[i, k]
+            at += 1
+    for j in range(s.n - 1):
+        for i in range(2):
+            for m in range(3):
+                out[at] = s.j[j, i, m] if s.type[j] != FREE else math.nan
+                at += 1
+
+
+@compiled
+def drain(s: Any, out: FloatArray) -> bool:
+    """Filter the next sample that is due, if any; write its results."""
+    while merge.advance(s):
+        if step(s):
+            emit(s, out)
+            return True
+    return False
+
+
+@compiled
+def run(
+    state: Any,
+    inputs: IntArray,
+    channels: IntArray,
+    t_ns: IntArray,
+    values: FloatArray,
+    out_message: IntArray,
+    out_t_ns: IntArray,
+    out_values: FloatArray,
+) -> int:
+    """Take merged messages; see :class:`..contract.KernelEstimator`."""
+    s = state[0]
+    count = 0
+    for m in range(t_ns.shape[0]):
+        merge.push(s, inputs[m], t_ns[m], values[m])
+        for _ in range(2):
+            if not drain(s, out_values[count]):
+                break
+            out_message[count] = m
+            out_t_ns[count] = s.now
+            count += 1
+    return count
+
+
+@compiled
+def run_end(state: Any, out_t_ns: IntArray, out_values: FloatArray) -> int:
+    """Give what is held back."""
+    s = state[0]
+    s.ending = 1
+    count = 0
+    while count < out_t_ns.shape[0] and drain(s, out_values[count]):
+        out_t_ns[count] = s.now
+        count += 1
+    return count
