@@ -37,6 +37,7 @@ WORK: list[Any] = [
     ("cov", "f8", (6, 6)),
     ("force", "f8", (2, 3)),
     ("force_jac", "f8", (2, 3, 3)),
+    ("cov_axes", "f8", (4, 4)),  # in the tangent planes
     ("cost", "f8"),
     ("axis_sd", "f8", (2,)),  # rad
     ("pos_sd", "f8"),  # m, across the axis
@@ -318,6 +319,7 @@ def fit_axes(
             w.axis[i, m] = w.best[i, m]
     # The pairing whose angles agree better (eqs 73, 74) is carried to the end of the joint cost; there the two
     # are compared again, now with better axes.
+    known = False
     for again in range(2):
         plus = pairing_misfit(w, rows, count, lag, 1.0)
         minus = pairing_misfit(w, rows, count, lag, -1.0)
@@ -374,9 +376,9 @@ def spread(w: Any, rows: FloatArray, count: int) -> None:
     for i in range(2):
         a = w.cov[2 * i, 2 * i] + w.cov[2 * i + 1, 2 * i + 1]
         w.axis_sd[i] = min(math.pi / 2.0, math.sqrt(scale * max(0.0, a)))
-        for m in range(2):
-            for n in range(2):
-                w.cov[2 * i + m, 2 * i + n] *= scale
+    for m in range(4):
+        for n in range(4):
+            w.cov_axes[m, n] = scale * w.cov[m, n]
 
 
 @compiled

@@ -48,6 +48,7 @@ DTYPE = np.dtype(
         ("anchored", "i8"),
         ("on_line", "i8"),
         ("q_gyr", "f8"),
+        ("k_gyr", "f8"),  # (s/√Hz)²: growth of q_gyr with the rate
         ("q_bias", "f8"),
         ("p_bias", "f8"),
         ("r_force", "f8"),  # 2 sd² τ
@@ -69,9 +70,13 @@ DTYPE = np.dtype(
         ("u", "f8", (3,)),
         ("v", "f8", (3,)),
         ("dev", "f8", (2,)),
-        ("flexion", "f8", (JOINTS,)),
         ("angle", "f8", (JOINTS, 3)),
         ("angle_sd", "f8", (JOINTS,)),
+        ("zero", "i8"),  # of the flexion: 0 by the mountings, 1 at the start, 2 by the encoder
+        ("zero_s", "f8"),
+        ("zero_sum", "f8", (JOINTS,)),
+        ("zero_count", "i8", (JOINTS,)),
+        ("zero_time", "f8"),
         ("steps", "i8"),
         ("misfit", "f8"),  # of the connection, running mean square over its variance
     ]
@@ -186,8 +191,9 @@ def predict(s: Any) -> None:
             x, y, z = s.P[c, a + 3], s.P[c, a + 4], s.P[c, a + 5]
             for k in range(3):
                 s.P[c, a + k] -= t * (s.rot[i, k, 0] * x + s.rot[i, k, 1] * y + s.rot[i, k, 2] * z)
+        rate2 = s.gyr[i, 0] ** 2 + s.gyr[i, 1] ** 2 + s.gyr[i, 2] ** 2
         for k in range(3):
-            s.P[a + k, a + k] += s.q_gyr * t
+            s.P[a + k, a + k] += (s.q_gyr + s.k_gyr * rate2) * t
             s.P[a + 3 + k, a + 3 + k] += s.q_bias * t
 
 
@@ -372,6 +378,22 @@ def measure_angles(s: Any) -> None:
 
 
 @compiled
+def set_zero(s: Any) -> None:
+    """Learn the zero of every flexion during the first ``zero_s`` seconds (running mean)."""
+    s.zero_time += s.dt
+    if s.zero == 0 or s.zero_time > s.zero_s:
+        return
+    for j in range(s.n - 1):
+        if s.valid[j] == 0 or s.valid[j + 1] == 0:
+            continue
+        target = 0.0 if s.zero == 1 else s.enc[j]
+        if math.isfinite(target):
+            mean = s.zero_sum[j] / max(1, s.zero_count[j])
+            s.zero_sum[j] += near(s.angle[j, 0] - target, mean)
+            s.zero_count[j] += 1
+
+
+@compiled
 def set_axes(s: Any) -> None:
     """Take the identified axes and position of the first joint; turn both mountings to the axes."""
     for i in range(2):
@@ -446,6 +468,7 @@ def emit(s: Any, out: FloatArray) -> None:
     for c in range(out.shape[0]):
         out[c] = math.nan
     measure_angles(s)
+    set_zero(s)
     at = 0
     for i in range(s.n):
         if s.valid[i] == 1:
@@ -456,6 +479,8 @@ def emit(s: Any, out: FloatArray) -> None:
         for k in range(1 if s.type[j] == HINGE else 3):
             if both:
                 out[at] = s.angle[j, k]
+                if k == 0:
+                    out[at] -= s.zero_sum[j] / max(1, s.zero_count[j])
             at += 1
     for j in range(s.n - 1):
         if s.valid[j] == 1 and s.valid[j + 1] == 1:

@@ -9,7 +9,7 @@ import numpy as np
 from ..contract import AlgorithmError, Context, FloatArray, Input, Output, Remark
 from ..parameters import meta
 from . import chain
-from .common import JointEstimator, MergeParams, imu, mounts
+from .common import JointEstimator, MergeParams, encoder, imu, mounts
 from .source import JOINT_STATE, NAMED, axis_remarks, lay_axes
 
 QUATERNION = "geometry_msgs/msg/QuaternionStamped"
@@ -23,6 +23,9 @@ class ChainParams(MergeParams, frozen=True, forbid_unknown_fields=True, kw_only=
     sd_gyr: Annotated[
         float, meta("Noise of the angular rate, with what the bias model leaves", "rad/s/√Hz", "ours", gt=0.0)
     ] = 0.002
+    grow_gyr: Annotated[
+        float, meta("Growth of that noise with the rate (scale, clipping)", "1/√Hz", "ours", ge=0.0)
+    ] = 0.01
     sd_bias: Annotated[float, meta("Gyroscope bias at the start", "rad/s", "ours", gt=0.0)] = 0.01
     walk_bias: Annotated[float, meta("Random walk of the bias", "rad/s/√s", "ours", ge=0.0)] = 1e-4
     sd_force: Annotated[float, meta("Acceleration of a segment in gravity's row", "m/s²", "ours", gt=0.0)] = (
@@ -43,6 +46,15 @@ class ChainParams(MergeParams, frozen=True, forbid_unknown_fields=True, kw_only=
     ] = 2.0
     tau_sway: Annotated[float, meta("Correlation time of the sway", "s", "ours", gt=0.0)] = 0.2
     sd_rest: Annotated[float, meta("Rate at rest against the bias", "rad/s", "ours", gt=0.0)] = 0.003
+    zero: Annotated[
+        Literal["mounting", "start", "encoder"],
+        meta(
+            "Where the flexion is zero: where the mountings say, in the mean pose of the first zero_s seconds, or so "
+            "that its mean over them is the encoder's",
+            source="ours",
+        ),
+    ] = "mounting"
+    zero_s: Annotated[float, meta("Length of that stretch", "s", "ours", gt=0.0)] = 10.0
 
 
 class HingeParams(ChainParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -103,6 +115,12 @@ class ChainEstimator(JointEstimator):
         s["gravity"] = p.gravity
         s["mount"][:n] = mounts(p, self.segments, context)
         s["q_gyr"], s["q_bias"], s["p_bias"] = p.sd_gyr**2, p.walk_bias**2, p.sd_bias**2
+        s["k_gyr"] = p.grow_gyr**2
+        s["zero"], s["zero_s"] = ("mounting", "start", "encoder").index(p.zero), p.zero_s
+        if p.zero == "encoder" and not context.has("encoder") and context.channels:
+            raise AlgorithmError(
+                f"{self.name}: zero = 'encoder' needs an encoder; attach one or use mounting"
+            )
         s["r_force"] = 2.0 * p.sd_force**2 * p.tau_force
         s["k_force"] = 2.0 * p.grow_force**2 * p.tau_force
         s["r_joint"] = 2.0 * p.sd_joint**2 * p.tau_joint
@@ -159,7 +177,7 @@ class JointHinge(ChainEstimator):
     title: ClassVar[str] = "hinge angle by rotations with axis, position and bias found on the way"
     source: ClassVar[str] = "ours; after Seel et al. 2014, Weygers and Kok 2020, Olsson et al. 2020"
     Params = HingeParams
-    inputs: tuple[Input, ...] = (imu("thigh"), imu("shank"))
+    inputs: tuple[Input, ...] = (imu("thigh"), imu("shank"), encoder(True))
 
     def lay_joints(self, context: Context) -> None:
         """Write axes and the identification's settings."""
@@ -188,7 +206,13 @@ class JointRelative(ChainEstimator):
     title: ClassVar[str] = "orientations and angles of a chain with hinge, two-axis and free joints (6D)"
     source: ClassVar[str] = "ours; after Kok et al. 2014, Weygers and Kok 2020, Laidig et al. 2017"
     Params = RelativeParams
-    inputs: tuple[Input, ...] = (imu("trunk", True), imu("thigh"), imu("shank"), imu("foot", True))
+    inputs: tuple[Input, ...] = (
+        imu("trunk", True),
+        imu("thigh"),
+        imu("shank"),
+        imu("foot", True),
+        encoder(True),
+    )
 
     def lay_joints(self, context: Context) -> None:
         """Write kinds, axes and positions of the joints."""
