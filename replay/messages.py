@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from itertools import chain
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -84,23 +82,16 @@ class MessageBlock:
 
     def messages(self) -> Iterator[Message]:
         """Yield the messages one by one."""
-        if len(self.pieces) == 1:
-            (piece,) = self.pieces
-            n = len(self)
-            names, topics = [piece.channel.input] * n, [piece.channel.topic] * n
-            values = piece.table.select(piece.channel.columns).rows()
-        else:
-            order = np.argsort(np.concatenate([p.places for p in self.pieces])).tolist()
-            rows = list(chain.from_iterable(p.table.select(p.channel.columns).rows() for p in self.pieces))
-            whose = list(
-                chain.from_iterable(
-                    [(p.channel.input, p.channel.topic)] * p.table.height for p in self.pieces
-                )
-            )
-            pick = itemgetter(*order) if len(order) > 1 else lambda x: (x[0],)
-            values = pick(rows)
-            names, topics = zip(*pick(whose), strict=True)
-        return map(Message, names, self.t_ns.tolist(), values, self.t_log_ns.tolist(), topics)
+        rows = [row for p in self.pieces for row in p.table.select(p.channel.columns).rows()]
+        if len(self.pieces) > 1:
+            order = np.argsort(np.concatenate([p.places for p in self.pieces]))
+            rows = list(map(rows.__getitem__, order.tolist()))
+        whose = np.empty(len(self), np.int64)
+        for number, piece in enumerate(self.pieces):
+            whose[piece.places] = number
+        names = np.array([p.channel.input for p in self.pieces], object)[whose].tolist()
+        topics = np.array([p.channel.topic for p in self.pieces], object)[whose].tolist()
+        return map(Message, names, self.t_ns.tolist(), rows, self.t_log_ns.tolist(), topics)
 
 
 @dataclass

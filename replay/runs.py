@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import copy
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from ..algorithms.contract import (
     FloatArray,
     IntArray,
     KernelEstimator,
+    Message,
     Output,
     Result,
     RowKernel,
@@ -34,6 +35,10 @@ from .rows import RowBlock, RowFeed
 _INTEGERS = {"index": np.uint32, "status": np.int8, "service": np.uint16}
 _MESSAGES_A_CALL = 8192
 """Messages that a kernel takes at once: what it reads and writes stays in the processor's cache."""
+
+
+_MESSAGES_A_TURN = 1024
+"""Messages between which results are gathered: objects that die young cost the garbage collector nothing."""
 
 
 @dataclass
@@ -301,7 +306,7 @@ class MessageRunner(Runner):
     def take(self, given: MessageBlock) -> dict[str, Block]:
         """Feed messages; return a block of every output that has something to say."""
         blocks: list[dict[str, Block]] = []
-        messages = None if self.kernel else list(given.messages())
+        messages = None if self.kernel else given.messages()
         values = self._encoded(given) if self.kernel else None
         for k, (a, b) in enumerate(pairwise([0, *given.resets, len(given)])):
             if k and self._state.samples:
@@ -311,7 +316,10 @@ class MessageRunner(Runner):
             self._state.samples += b - a
             self._state.last_log_ns = int(given.t_log_ns[b - 1])
             if messages is not None:
-                blocks.append(self._one_by_one(messages[a:b], given.keys[a:b]))
+                for first in range(a, b, _MESSAGES_A_TURN):
+                    last = min(first + _MESSAGES_A_TURN, b)
+                    logs, keys = given.t_log_ns[first:last], given.keys[first:last]
+                    blocks.append(self._one_by_one(islice(messages, last - first), logs, keys))
             else:
                 assert values is not None
                 blocks.append(self._through_kernel(given, values, a, b))
@@ -366,20 +374,23 @@ class MessageRunner(Runner):
         columns = np.ascontiguousarray(np.concatenate(rows).T)
         return self._by_output(columns, np.concatenate(times), given.t_log_ns[cause], given.keys[cause])
 
-    def _one_by_one(self, messages: Sequence[Any], keys: IntArray) -> dict[str, Block]:
-        found: list[tuple[int, Result]] = []
+    def _one_by_one(self, messages: Iterable[Message], logs: IntArray, keys: IntArray) -> dict[str, Block]:
+        whose: list[int] = []
+        found: list[Result] = []
         take = self.estimator.take
         begin = time.perf_counter()
         for i, message in enumerate(messages):
             results = take(message)
             if results:
                 if type(results) is Result:
-                    found.append((i, results))
+                    found.append(results)
+                    whose.append(i)
                 else:
-                    found += [(i, r) for r in results]
+                    for result in results:
+                        found.append(result)
+                        whose.append(i)
         self.loop_s += time.perf_counter() - begin
-        logs = np.array([m.log_ns for m in messages], np.int64)
-        return self._blocks_of(found, logs, keys)
+        return self._blocks_of(found, whose, logs, keys)
 
     def _held_back(self, key: int) -> dict[str, Block]:
         state = self._state
@@ -392,39 +403,44 @@ class MessageRunner(Runner):
             n = len(t_ns)
             columns = np.ascontiguousarray(values.T)
             return self._by_output(columns, t_ns, np.full(n, state.last_log_ns), np.full(n, key)) if n else {}
-        found = [(0, r) for r in self.estimator.finish() or ()]
+        found = list(self.estimator.finish() or ())
         self.loop_s += time.perf_counter() - begin
-        return self._blocks_of(found, np.array([state.last_log_ns]), np.array([key]))
+        return self._blocks_of(found, [0] * len(found), np.array([state.last_log_ns]), np.array([key]))
 
-    def _blocks_of(self, found: list[tuple[int, Result]], logs: IntArray, keys: IntArray) -> dict[str, Block]:
-        """Return single results as one block an output."""
+    def _blocks_of(
+        self, found: list[Result], whose: list[int], logs: IntArray, keys: IntArray
+    ) -> dict[str, Block]:
+        """Return single results as one block an output; ``whose[k]`` is the message that caused result k."""
         if not found:
             return {}
-        by_name: dict[str, tuple[list[int], list[int], list[Sequence[Any]]]] = {}
-        for i, (name, t_ns, values) in found:
-            if name not in by_name:
-                by_name[name] = ([], [], [])
-            whose, times, rows = by_name[name]
-            whose.append(i)
-            times.append(t_ns)
-            rows.append(values)
+        names, times, rows = zip(*found, strict=True)
+        cause, t_ns = np.array(whose), np.array(times, np.int64)
+        places: dict[str, IntArray] = {}
+        if len(different := dict.fromkeys(names)) > 1:
+            number = {name: k for k, name in enumerate(different)}
+            numbers = np.fromiter(map(number.__getitem__, names), np.int64, len(names))
+            places = {name: np.flatnonzero(numbers == k) for name, k in number.items()}
         blocks: dict[str, Block] = {}
-        for name, (whose, times, rows) in by_name.items():
+        for name in different:
             output = self.outputs.get(name)
             if output is None:
                 raise MarchaError(
                     f"estimator {self.plan.name} gave a result for {name!r}; it declares {', '.join(self.outputs)}"
                 )
-            if any(len(r) != len(output.columns) for r in rows):
-                bad = next(r for r in rows if len(r) != len(output.columns))
+            at = places.get(name)
+            mine = rows if at is None else [rows[k] for k in at.tolist()]
+            width = len(output.columns)
+            if set(map(len, mine)) != {width}:
+                bad = next(r for r in mine if len(r) != width)
                 raise MarchaError(
                     f"estimator {self.plan.name}: a result of {name!r} has {len(bad)} values, "
-                    f"its output has {len(output.columns)} columns: {', '.join(output.columns)}"
+                    f"its output has {width} columns: {', '.join(output.columns)}"
                 )
-            data: Columns = {"t_ns": np.array(times, np.int64), "t_log_ns": logs[whose]}
-            for column, values in zip(output.columns, zip(*rows, strict=True), strict=True):
+            caused, when = (cause, t_ns) if at is None else (cause[at], t_ns[at])
+            data: Columns = {"t_ns": when, "t_log_ns": logs[caused]}
+            for column, values in zip(output.columns, zip(*mine, strict=True), strict=True):
                 data[column] = np.array(values)
-            blocks[name] = self._block(output, data, keys[whose])
+            blocks[name] = self._block(output, data, keys[caused])
         return blocks
 
 
