@@ -119,7 +119,7 @@ def test_numbered_states_are_lanes_with_the_names_that_the_channel_gives_them(tm
     rec = write(
         tmp_path / "a.mcap",
         {topic: ("marcha_msgs/msg/NamedValues", table)},
-        **{topic: {"states.jump": "T,S,TS"}},
+        **{topic: {"states.jump": "T,S,TS", "states": "unused"}},
     )
     viz.write_rrd(rec, tmp_path / "a.rrd")
     from .test_viz_rrd import column

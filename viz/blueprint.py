@@ -15,6 +15,7 @@ from rerun.encodings import EntityPathLike
 
 from . import top_view
 from .canvas import COMPARE, DETECTOR, OVERVIEW, REPORT, SPACE, TABS, Canvas, Entry, Floats
+from .shapes import EQUATOR_M, metres_a_degree
 from .timeaxis import SINCE_START
 from .trace import STANDING_M, Trace, framed
 
@@ -28,6 +29,9 @@ HEIGHT = "height above the start (m)"
 DISTANCE = "distance to the reference (m)"
 BACKGROUND = (24, 28, 34)
 SPATIAL = ("space", "map")
+MAP_POINTS = 250.0
+"""Points of the screen that the tracks on a map should take."""
+
 GRID_PLOTS = 4
 """More plots of a tab than these stand in two columns."""
 
@@ -146,12 +150,26 @@ def _view(entries: Sequence[Entry], canvases: Sequence[Canvas]) -> Part:
     if kind == "map":
         past = _past(entries, canvases)
         provider = rrb.MapProvider.OpenStreetMap
-        return rrb.MapView(origin="/", contents=contents, name=panel, background=provider, overrides=past)
+        zoom = _zoom([c for canvas in canvases for c in canvas.geo])
+        return rrb.MapView(
+            origin="/", contents=contents, name=panel, zoom=zoom, background=provider, overrides=past
+        )
     if kind == "space":
         return _space(panel, entries, canvases)
     if kind == "log":
         return rrb.TextLogView(origin="/", contents=contents, name=panel)
     return rrb.TextDocumentView(origin=entries[0].path, contents=contents, name=panel)
+
+
+def _zoom(corners: Sequence[Floats]) -> float | None:
+    """Return the zoom of a map (powers of two of the whole globe in 256 points) at which all is seen."""
+    if not corners:
+        return None
+    low, high = np.min(corners, axis=0), np.max(corners, axis=0)
+    size = max(float(np.max((high - low) * metres_a_degree(low[:1])[0])), 10.0)
+    a_point = size / MAP_POINTS
+    globe = 2 * np.pi * EQUATOR_M * np.cos(np.radians(low[0])) / 256
+    return float(np.clip(np.log2(globe / a_point), 1.0, 22.0))
 
 
 def _plot(name: str, contents: Sequence[str], span: tuple[float, float] | None) -> rrb.TimeSeriesView:
@@ -205,7 +223,9 @@ def _past(
 def _space(panel: str, entries: Sequence[Entry], canvases: Sequence[Canvas]) -> Part:
     """Return the 3D view of a panel; where there is a floor plan, the tracks from above lie before it."""
     if panel != SPACE:
-        return _solid(panel, entries, canvases, np.array([-1.0, -1.0, -0.9]), np.array([1.0, 1.0, 0.6]))
+        found = [c for canvas in canvases for c in canvas.solid.get(panel, [])]
+        corners = np.array(found or [np.full(3, -0.5), np.full(3, 0.5)], dtype=float)
+        return _solid(panel, entries, canvases, corners.min(axis=0), corners.max(axis=0), least=0.8)
     low, high = extent(canvases)
     solid = _solid(panel, entries, canvases, low, high)
     if not any(c.flat for c in canvases):
@@ -214,9 +234,15 @@ def _space(panel: str, entries: Sequence[Entry], canvases: Sequence[Canvas]) -> 
 
 
 def _solid(
-    name: str, entries: Sequence[Entry], canvases: Sequence[Canvas], low: Floats, high: Floats
+    name: str,
+    entries: Sequence[Entry],
+    canvases: Sequence[Canvas],
+    low: Floats,
+    high: Floats,
+    least: float = 2.0,
 ) -> rrb.Spatial3DView:
-    centre, size = (low + high) / 2, max(float(np.linalg.norm((high - low)[:2])), 2.0)
+    across = high - low if least < 2.0 else (high - low)[:2]  # a walk's height is small beside its way
+    centre, size = (low + high) / 2, max(float(np.linalg.norm(across)), least)
     return rrb.Spatial3DView(
         origin="/",
         contents=[e.path for e in entries],

@@ -157,6 +157,10 @@ class Canvas:
         Topics with reference positions.
     plan : FloorPlan
         Anchors and plan, once they are drawn.
+    geo : list of ndarray
+        Corners (latitude and longitude, °) of what is on the map, empty where nothing is.
+    solid : dict of str to list of ndarray
+        Corners (3,), m, of what is in a panel of a space of its own (segments, markers), by panel.
     store : dict
         What views of one recording share, under a name of their own.
     flat : bool
@@ -186,6 +190,8 @@ class Canvas:
         self.last_ns: int | None = None
         self.plan = FloorPlan()
         self.store: dict[str, Any] = {}
+        self.geo: list[Floats] = []
+        self.solid: dict[str, list[Floats]] = {}
         self.flat = False
         self._origin: Floats | None = None
         topics = [c.topic for c in self.channels]
@@ -278,6 +284,16 @@ class Canvas:
             self._origin = np.round(first) if np.abs(first).max() > FAR_M else np.zeros(3)
         near = np.abs(first - self._origin).max() <= FAR_M
         return self._origin if near else np.round(first)
+
+    @staticmethod
+    def reach(corners: list[Floats], points: Floats) -> None:
+        """Widen corners so that points (n, k) lie between them."""
+        points = np.concatenate([*(c[None, :] for c in corners), points])
+        corners[:] = [points.min(axis=0), points.max(axis=0)]
+
+    def hide(self, path: str) -> None:
+        """Take an entity out of all panels: it holds nothing worth seeing."""
+        self.entries = [e for e in self.entries if e.path != path]
 
     # -- logging
 

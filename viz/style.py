@@ -19,8 +19,8 @@ RUNS = ("#2F8FD0", "#D55E00", "#009E73", "#B86FA5", "#C98500", "#1AA3A3", "#8F7B
 REFERENCE = "#8A8A8A"
 THRESHOLD = "#E0556F"
 NORM = "#8F7BE0"
-ENCODER = "#B86FA5"
-"""Angles and orientations that a device states itself."""
+DEVICE = "#B86FA5"
+"""What a device states itself: angles of an encoder, orientations, fixes."""
 
 STILL = "#009E73"
 MOVING = "#8A8A8A"

@@ -30,9 +30,12 @@ FAR_ABOVE = 5.0
 """A statistic that rises more than so many times above its threshold is shown up to there: else the
 threshold is at zero."""
 
-STATE_OUTPUTS = ("jump", "use", "mode", "state", "zone")
-"""Outputs of named values that are states: numbers of a list, drawn as lanes. The channel's metadata
-``states.<column>`` (``T,S,TS``) names them from 0 on."""
+STATE_COLUMNS = ("state", "mode", "zone")
+"""Columns of named values that are states: numbers of a list, drawn as lanes. The channel's metadata ``states``
+names them from 0 on (``T,S,TS``); ``states.<column>`` does so for any column."""
+
+USE = "use"
+"""An output of this name says by 0 and 1 what is used: a lane each."""
 
 LONGEST = 300
 """Characters of a text in the log; the recording has all of it."""
@@ -79,7 +82,7 @@ class General(View):
                 place = count.setdefault(units[c], 0)
                 count[units[c]] += 1
                 self.canvas.lines(f"{self.path}/{slug(c)}", [self.shown[c].name], [style.axis_color(place)])
-                panel = f"{head} ({units[c]})" if units[c] else head
+                panel = self._panel(c, head, units[c])
                 at = f"{self.path}/{slug(c)}"
                 self.canvas.show("plot", at, tab=self.tab, panel=panel, owner=self.owner)
         for c in self.flags:
@@ -89,6 +92,10 @@ class General(View):
         if self.texts:
             self.log = f"{self.canvas.prefix}/log{self.path.removeprefix(self.canvas.prefix)}"
             self.canvas.show("log", self.log, tab=REPORT, panel="texts", owner=self.owner)
+
+    def _panel(self, column: str, head: str, unit: str) -> str:
+        """Return the panel of a column where the channel has several units."""
+        return f"{head} ({unit})" if unit else head
 
     def _unit(self, column: str, kind: str) -> str:
         if kind == "time":
@@ -212,8 +219,8 @@ class Velocity(View):
 
 
 class Values(View):
-    """Named values (statistics of a detector, internals of a filter): each by itself, with its own
-    thresholds.
+    """Named values (internals of a filter), one panel a unit; those of a detector each by itself, with its own
+    thresholds; numbered states as lanes. The channel's metadata ``unit`` says the unit of all of them.
     """
 
     title = "named values, each with its thresholds; states as lanes"
@@ -221,30 +228,39 @@ class Values(View):
 
     def begin(self) -> None:
         canvas = self.canvas
-        labels = {k[7:]: v for k, v in self.channel.metadata.items() if k.startswith("states.")}
+        said = self.channel.metadata
         columns = list(self.channel.columns)
-        states = [c for c in columns if c in labels or self.what in STATE_OUTPUTS]
+        labels = {c: said.get("states", "") for c in columns if c in STATE_COLUMNS}
+        labels |= {k[7:]: v for k, v in said.items() if k.startswith("states.")}
+        if self.what == USE:
+            labels |= dict.fromkeys(columns, ",used")
+        states = [c for c in columns if c in labels]
         self.lanes: dict[str, tuple[Lane, list[str]]] = {}
         for name in states:
-            words = [printable(w.strip()) for w in labels.get(name, "").split(",") if w.strip()]
+            words = [printable(w.strip()) for w in labels[name].split(",")] if labels[name] else []
             at = f"{self.path}/{slug(name)}"
-            colors = {w: style.run_color(i) for i, w in enumerate(words)}
+            colors = {w: style.run_color(i) for i, w in enumerate(words) if w}
             self.lanes[name] = (Lane(canvas, at, colors), words)
             for tab in (OVERVIEW, self._tab()):
                 canvas.show("lanes", at, tab=tab, panel="lanes", owner=self.owner)
-        self.shown = {c: shown_as(c) for c in columns if c not in self.lanes}
+        unit = said.get("unit", "")
+        self.shown = {c: shown_as(c, unit) for c in columns if c not in self.lanes}
         self.highest = dict.fromkeys(self.shown, 0.0)
-        for name, shown in self.shown.items():
+        for number, (name, shown) in enumerate(self.shown.items()):
             path = f"{self.path}/{slug(name)}"
-            canvas.lines(path, [shown.name], [self.color])
-            panel = f"{self.owner}: {shown.name}"
-            canvas.show("plot", path, tab=self._tab(), panel=panel, owner=self.owner, stack=self._stack())
+            alone = self._tab() == DETECTOR
+            canvas.lines(path, [shown.name], [self.color if alone else style.axis_color(number)])
+            unit = unit_in(shown.name)
+            together = f"{self.owner} {self.what}" if self.role == "estimate" else self.owner
+            panel = f"{self.owner}: {shown.name}" if alone else together + (f" ({unit})" if unit else "")
+            self._show(name, path, panel)
+
+    def _show(self, name: str, path: str, panel: str) -> None:
+        """Say where a value is shown."""
+        self.canvas.show("plot", path, tab=self._tab(), panel=panel, owner=self.owner)
 
     def _tab(self) -> str:
         return DETECTOR if self.what == "detector" and self.role == "estimate" else self.tab
-
-    def _stack(self) -> str:
-        return ""
 
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
         for name, shown in self.shown.items():

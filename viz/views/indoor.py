@@ -24,10 +24,12 @@ class ByTransmitter(View):
 
     column: str
     unit: str
+    tabs: tuple[str, ...] = (RADIO,)
 
     def begin(self) -> None:
         self.counts: dict[str, int] = {}
-        self.panel = f"{self.owner} {self.what} ({self.unit})"
+        what = "" if self.what in self.owner else f" {self.what}"
+        self.panel = f"{self.owner}{what} ({self.unit})"
         self.log = f"{self.canvas.prefix}/log{self.path.removeprefix(self.canvas.prefix)}"
 
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
@@ -47,7 +49,8 @@ class ByTransmitter(View):
     def _style(self, mac: str, number: int) -> None:
         self.canvas.points(self._at(mac), printable(mac), style.run_color(number), "circle", 2.5)
         if number < MOST:  # a live view cannot wait for the end
-            self.canvas.show("plot", self._at(mac), tab=RADIO, panel=self.panel, owner=self.owner)
+            for tab in self.tabs:
+                self.canvas.show("plot", self._at(mac), tab=tab, panel=self.panel, owner=self.owner)
 
     def _line(self, mac: str, t_ns: Times, values: np.ndarray) -> None:
         self.canvas.scalars(self._at(mac), t_ns, values)
@@ -61,7 +64,8 @@ class ByTransmitter(View):
         canvas.entries = [e for e in canvas.entries if e.panel != printable(self.panel)]
         panel = f"{self.panel}, {MOST} of {len(self.counts)} transmitters"
         for mac in ordered[:MOST]:
-            canvas.show("plot", self._at(mac), tab=RADIO, panel=panel, owner=self.owner)
+            for tab in self.tabs:
+                canvas.show("plot", self._at(mac), tab=tab, panel=panel, owner=self.owner)
 
 
 class Signals(ByTransmitter):
@@ -70,7 +74,7 @@ class Signals(ByTransmitter):
     title = "signal strength by transmitter"
     schemas = ("marcha_msgs/msg/RadioSignal",)
     needs = ("mac", "rssi_dbm")
-    column, unit = "rssi_dbm", "dBm"
+    column, unit, tabs = "rssi_dbm", "dBm", (OVERVIEW, RADIO)
 
 
 class Ranges(ByTransmitter):

@@ -6,6 +6,8 @@ of segments, the segments themselves as a moving figure, optical markers.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import polars as pl
 import rerun as rr
@@ -18,7 +20,8 @@ from ..curve import Curve
 from .base import View, role_of
 from .common import EULER, Values, euler_deg, slug
 
-FIGURE = "segments"
+FIGURE, MARKERS = "segments", "markers"
+AXIS_ENDS = tuple(f"_{a}" for a in EULER)
 MAX_GAP_S = 0.1
 """A reference is not interpolated over longer gaps."""
 
@@ -52,7 +55,7 @@ class Angles(View):
     def begin(self) -> None:
         canvas = self.canvas
         self.columns: dict[str, tuple[str, float]] = {}
-        color = style.ENCODER if self.role == "raw" else self.color
+        color = style.DEVICE if self.role == "raw" else self.color
         tab = JOINTS
         self.joints = [c for c in self.channel.columns if not c.endswith((".vel", ".effort"))]
         for joint in self.joints:
@@ -74,27 +77,66 @@ class Angles(View):
                 series_of(self.canvas)[self.channel.topic, column].add(t_ns, values)
 
     def end(self) -> None:
-        if self.role != "estimate":
-            return
-        canvas = self.canvas
-        for joint in self.joints:
-            topic = angle_reference(canvas, self.channel, joint)
-            if topic is None:
-                continue
-            own, truth = series_of(canvas)[self.channel.topic, joint], series_of(canvas)[topic]
-            t_ns, error = difference(own, truth)
-            if not t_ns.size:
-                continue
-            path = f"{self.path}/{slug(joint)}/error"
-            canvas.lines(path, [f"{self.owner} {joint} error (°)"], [self.color])
+        if self.role == "estimate":
+            draw_errors(self, self.joints)
+
+
+def draw_errors(view: View, names: Sequence[str]) -> None:
+    """Log the error of every angle of a run that has a reference."""
+    canvas, topic = view.canvas, view.channel.topic
+    for name in names:
+        other = angle_reference(canvas, view.channel, name)
+        if other is None:
+            continue
+        t_ns, error = difference(series_of(canvas)[topic, name], series_of(canvas)[other])
+        if t_ns.size:
+            path = f"{view.path}/{slug(name)}/error"
+            canvas.lines(path, [f"{view.owner} {name} error (°)"], [view.color])
             canvas.scalars(path, t_ns, error)
-            panel = error_panel(joint)
-            canvas.show("plot", path, tab=JOINTS, panel=panel, owner=self.owner)
+            # the axes of a segment lie behind each other
+            stack = f"{name.rpartition('_')[0]} error" if name.endswith(AXIS_ENDS) else ""
+            panel = error_panel(name)
+            canvas.show("plot", path, tab=JOINTS, panel=panel, owner=view.owner, stack=stack)
+
+
+class Attitudes(Values):
+    """Angles of segments as named values (``thigh_roll``), beside those of the reference's orientation."""
+
+    title = "angles of segments, beside the reference's"
+    priority = 1
+
+    @classmethod
+    def fits(cls, channel: ChannelLike) -> bool:
+        names = channel.columns
+        return super().fits(channel) and bool(names) and all(c.endswith(AXIS_ENDS) for c in names)
+
+    def begin(self) -> None:
+        super().begin()
+        for name in self.shown:
+            series_of(self.canvas)[self.channel.topic, name] = Curve()
+            at = f"{self.path}/{slug(name)}"
+            self.canvas.lines(at, [f"{self.owner} {name.replace('_', ' ')} (°)"], [self.color])
+
+    def _show(self, name: str, path: str, panel: str) -> None:
+        segment, _, axis = name.rpartition("_")
+        said = f"{segment} {axis} (°)"
+        self.canvas.show("plot", path, tab=JOINTS, panel=said, owner=self.owner, stack=segment, alone=True)
+
+    def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
+        super().draw(t_ns, block)
+        for name, shown in self.shown.items():
+            values = columns_of(block, [name], [shown.factor])[:, 0]
+            series_of(self.canvas)[self.channel.topic, name].add(t_ns, values)
+
+    def end(self) -> None:
+        super().end()
+        if self.role == "estimate":
+            draw_errors(self, list(self.shown))
 
 
 def error_panel(joint: str) -> str:
     """Return the name of the panel of a joint's error."""
-    return f"{joint} error and ±1σ (°)"
+    return f"{joint.replace('_', ' ')} error and ±1σ (°)"
 
 
 def angle_reference(canvas: Canvas, channel: ChannelLike, joint: str) -> tuple[str, str] | None:
@@ -107,19 +149,22 @@ def angle_reference(canvas: Canvas, channel: ChannelLike, joint: str) -> tuple[s
         same = [k for k in found if k[1] == joint]
         if same:
             return same[0]
-        if len(found) == 1 and sum(k[0] == channel.topic for k in series_of(canvas)) == 1:
+        found = [k for k in found if not k[1].endswith(AXIS_ENDS)]
+        own = [k for k in series_of(canvas) if k[0] == channel.topic]
+        if len(found) == len(own) == 1 and not joint.endswith(AXIS_ENDS):
             return found[0]
     return None
 
 
 def difference(own: Curve, truth: Curve) -> tuple[Times, Floats]:
-    """Return times (n,) and estimate minus reference (n,), where both are known."""
+    """Return times (n,) and estimate minus reference (n,), ° in [−180, 180), where both are known."""
     t, v = own.finite()
     t_ref, v_ref = truth.finite()
     found = match(t, t_ref, MAX_GAP_S)
     if not len(found.index):
         return np.empty(0, np.int64), np.empty(0)
-    return t[found.index], v[found.index] - found.linear(v_ref[:, None])[:, 0]
+    error = v[found.index] - found.linear(v_ref[:, None])[:, 0]
+    return t[found.index], (error + 180.0) % 360.0 - 180.0
 
 
 class AngleSigma(Values):
@@ -178,7 +223,7 @@ class Orientation(View):
     def begin(self) -> None:
         canvas = self.canvas
         self.segment = segment_of(self.channel.topic)
-        color = self.color if self.role != "raw" else style.ENCODER
+        color = self.color if self.role != "raw" else style.DEVICE
         if self.segment is None:
             canvas.lines(self.path, [f"{a} (°)" for a in EULER], style.AXES)
             panel = f"{self.owner} {self.what} (°)" if self.role == "estimate" else f"{self.owner} (°)"
@@ -186,6 +231,7 @@ class Orientation(View):
             canvas.show("plot", self.path, tab=tab, panel=panel, owner=self.owner, alone=True)
             return
         for axis in EULER:
+            series_of(canvas)[self.channel.topic, f"{self.segment}_{axis}"] = Curve()
             path = f"{self.path}/{axis}"
             canvas.lines(path, [f"{self.owner} {axis} (°)"], [color])
             panel = f"{self.segment} {axis} (°)"
@@ -203,7 +249,7 @@ class Orientation(View):
         self.at = f"{self.figure}/{slug(self.segment)}"
         ends = np.array([[0.0, 0.0, 0.0], self.bone], dtype=np.float32)
         rgb = style.rgb(color)
-        bone = rr.LineStrips3D([ends], colors=rgb, radii=0.02 if self.role != "reference" else 0.012)
+        bone = rr.LineStrips3D([ends], colors=rgb, radii=0.02 if self.role != "reference" else 0.03)
         canvas.static(f"{self.at}/bone", bone)
         canvas.static(f"{self.at}/axes", rr.TransformAxes3D(0.12))
         label = rr.Points3D([ends[1] * 0.5], labels=[self.segment], colors=rgb, radii=0.005, show_labels=True)
@@ -220,6 +266,7 @@ class Orientation(View):
             return
         for i, axis in enumerate(EULER):
             self.canvas.scalars(f"{self.path}/{axis}", t_ns, angles[:, i])
+            series_of(self.canvas)[self.channel.topic, f"{self.segment}_{axis}"].add(t_ns, angles[:, i])
         good = np.isfinite(turn).all(axis=1)
         self.waiting.append((t_ns[good], turn[good]))
         self._bones(whole=False)
@@ -227,6 +274,8 @@ class Orientation(View):
     def end(self) -> None:
         if self.segment is not None:
             self._bones(whole=True)
+            if self.role == "estimate":
+                draw_errors(self, [f"{self.segment}_{axis}" for axis in EULER])
 
     def _bones(self, whole: bool) -> None:
         """Log the bone where the end of the one above is known; hold it where that one has ended."""
@@ -246,6 +295,7 @@ class Orientation(View):
         end = start + rotated(turn, np.asarray(self.bone))
         tip = self.tips.setdefault(self.segment or "", Tips())
         tip.add(t_ns, end)
+        self.canvas.reach(self.canvas.solid.setdefault(FIGURE, []), np.concatenate([start, end]))
         columns = rr.Transform3D.columns(
             translation=start.astype(np.float32), quaternion=xyzw_from_wxyz(turn).astype(np.float32)
         )
@@ -336,8 +386,10 @@ class Markers(View):
         canvas = self.canvas
         self.names = [c.removesuffix(".x") for c in self.channel.columns if c.endswith(".x")]
         self.at = f"{self.path}/points"
-        canvas.static(self.at, rr.Points3D.from_fields(colors=style.rgb(self.color), radii=0.012))
-        canvas.show("space", self.at, tab=JOINTS, panel="markers", owner=self.owner)
+        canvas.static(
+            self.at, rr.Points3D.from_fields(colors=style.rgb(self.color), radii=rr.Radius.ui_points(5.0))
+        )
+        canvas.show("space", self.at, tab=JOINTS, panel=MARKERS, owner=self.owner)
         colors = [style.run_color(i) for i in range(len(self.names))]
         self.heights = f"{self.path}/height"
         canvas.lines(self.heights, [f"{n} z (m)" for n in self.names], colors)
@@ -351,5 +403,7 @@ class Markers(View):
         self.canvas.scalars(self.heights, t_ns, places[:, :, 2])
         seen = np.isfinite(places).all(axis=2)
         counts = seen.sum(axis=1)
+        if seen.any():
+            self.canvas.reach(self.canvas.solid.setdefault(MARKERS, []), places[seen])
         columns = rr.Points3D.columns(positions=places[seen].astype(np.float32)).partition(counts)
         self.canvas.columns(self.at, t_ns, columns)

@@ -15,6 +15,8 @@ from .common import General
 
 MAP = "map"
 SD = ("sd_east_m", "sd_north_m")
+PANELS = {"lat_deg": "latitude", "lon_deg": "longitude", "alt_m": "altitude"}
+"""Numbers of such different sizes that each has a panel of its own; the rest are accuracies."""
 
 
 class Fix(General):
@@ -28,9 +30,13 @@ class Fix(General):
     needs = ("lat_deg", "lon_deg")
     priority = 0
 
+    def _panel(self, column: str, head: str, unit: str) -> str:
+        named = PANELS.get(column, "accuracy" if column.startswith("sd_") else "")
+        return super()._panel(column, f"{head} {named}".strip(), unit)
+
     def begin(self) -> None:
         super().begin()
-        canvas, color = self.canvas, style.rgb(style.AXES[2] if self.role == "raw" else self.color)
+        canvas, color = self.canvas, style.rgb(style.DEVICE if self.role == "raw" else self.color)
         self.line: list[Floats] = []
         self.points, self.circles = f"{self.path}/map/fixes", f"{self.path}/map/accuracy"
         canvas.static(self.points, rr.GeoPoints.from_fields(colors=color, radii=rr.Radius.ui_points(4.0)))
@@ -47,6 +53,8 @@ class Fix(General):
         good = np.flatnonzero(np.isfinite(place).all(axis=1))
         place, t_ns, block = place[good], t_ns[good], block[good]
         self.canvas.columns(self.points, t_ns, rr.GeoPoints.columns(positions=place))
+        if len(place):
+            self.canvas.reach(self.canvas.geo, place)
         if self.role != "raw":
             self.line.append(place)
         if self.accuracy:

@@ -83,6 +83,8 @@ class Positions(View):
         line = self.trace.positions.astype(np.float32)
         if not len(line):
             return
+        if np.ptp(line[:, 2]) == 0.0:  # a track in the plane
+            canvas.hide(f"{self.base}/height")
         color = style.rgb(self.color)
         canvas.static(
             f"{self.base}/track",
