@@ -106,11 +106,11 @@ def test_a_known_name_with_other_fields_is_drawn_as_what_it_holds(tmp_path: Path
 
 
 def test_numbers_of_several_units_have_a_panel_a_unit(tmp_path: Path) -> None:
-    table = example_table("sensor_msgs/msg/NavSatFix")
-    rec = write(tmp_path / "a.mcap", {"/phone/gnss": ("sensor_msgs/msg/NavSatFix", table)})
+    table = example_table("geometry_msgs/msg/TwistStamped")
+    rec = write(tmp_path / "a.mcap", {"/body/twist": ("geometry_msgs/msg/TwistStamped", table)})
     _, canvas = drawn(rec, tmp_path)
     panels = {e.panel for e in canvas.entries if e.kind == "plot"}
-    assert {"/phone/gnss (°)", "/phone/gnss (m)"} <= panels
+    assert {"/body/twist (m/s)", "/body/twist (rad/s)"} <= panels
 
 
 def test_numbered_states_are_lanes_with_the_names_that_the_channel_gives_them(tmp_path: Path) -> None:
@@ -336,3 +336,146 @@ def test_drawing_again_and_again_keeps_threads_and_memory_flat(strap: mr.Recordi
     for _ in range(8):
         viz.write_rrd(strap, tmp_path / "a.rrd", overwrite=True)
     assert process.num_threads() <= before + 1
+
+
+# -- phones, radio, legs -----------------------------------------------------------------------------
+
+
+def test_a_phone_s_recording_is_on_the_map_with_its_accuracy(tmp_path: Path) -> None:
+    from .test_viz_rrd import column
+    from .viz_walks import phone
+
+    rec = phone(tmp_path / "a.mcap", seconds=20)
+    assert unseen(rec, tmp_path) == []
+    path = tmp_path / "drawn.rrd"
+    fix = rec.table("/phone/gnss")
+    _, place = column(path, "/phone/gnss/map/fixes", "GeoPoints:positions")
+    np.testing.assert_array_equal(place[:, 0], fix.select("lat_deg", "lon_deg").to_numpy())
+    _, ring = column(path, "/phone/gnss/map/accuracy", "GeoLineStrings:line_strings")
+    from pyproj import Geod
+
+    lat, lon = ring[0, 0].T
+    centre = fix.row(0, named=True)
+    n = len(lat)
+    _, _, gone = Geod(ellps="WGS84").inv([centre["lon_deg"]] * n, [centre["lat_deg"]] * n, lon, lat)
+    np.testing.assert_allclose(gone, 5.0, atol=1e-3)
+
+
+def test_steps_are_points_on_the_norm(tmp_path: Path) -> None:
+    from .test_viz_rrd import column
+    from .viz_walks import phone
+
+    rec = phone(tmp_path / "a.mcap", seconds=20)
+    viz.write_rrd(rec, tmp_path / "a.rrd")
+    steps = rec.table("/estimate/phone_fused_phone_imu/step")
+    t_ns, value = column(tmp_path / "a.rrd", "/run/phone_fused_phone_imu/step/on_norm", "Scalars:scalars")
+    imu = rec.table("/phone/imu")
+    norm = np.linalg.norm(imu.select("acc_x", "acc_y", "acc_z").to_numpy(), axis=1)
+    t = imu["t_ns"].to_numpy()
+    np.testing.assert_array_equal(t_ns, steps["t_ns"].to_numpy() - t[0])
+    np.testing.assert_allclose(value[:, 0], np.interp(t_ns, t - t[0], norm), atol=1e-9)
+
+
+def test_ranges_are_circles_about_their_anchors_in_the_plane_of_the_floor(tmp_path: Path) -> None:
+    from .test_viz_rrd import column
+    from .viz_walks import ANCHORS, indoor
+
+    rec = indoor(tmp_path / "a.mcap")
+    assert unseen(rec, tmp_path) == []
+    mac = "00:00:00:00:00:01"
+    x, y, z = ANCHORS[mac][1]
+    entity = f"/run/indoor_trilateration/ranges/circle/{rr.escape_entity_path_part(mac)}"
+    _, ring = column(tmp_path / "drawn.rrd", entity, "LineStrips3D:strips")
+    ranges = rec.table("/estimate/indoor_trilateration/ranges").filter(pl.col("mac") == mac)
+    for strip, slope in zip(ring[:, 0], ranges["distance_m"], strict=True):
+        radius = np.hypot(strip[:, 0] - x, strip[:, 1] - y)
+        np.testing.assert_allclose(radius, np.sqrt(slope**2 - z**2), rtol=1e-5)
+
+
+def test_the_ellipse_is_that_of_95_percent_about_the_position(tmp_path: Path) -> None:
+    from scipy.stats import chi2
+
+    from .test_viz_rrd import column
+    from .viz_walks import indoor
+
+    rec = indoor(tmp_path / "a.mcap")
+    viz.write_rrd(rec, tmp_path / "a.rrd")
+    _, ring = column(tmp_path / "a.rrd", "/run/indoor_fused/ellipse", "LineStrips3D:strips")
+    at = rec.table("/estimate/indoor_fused/position").select("pos_x", "pos_y").to_numpy()
+    sigma = rec.table("/estimate/indoor_fused/sigma").select("sigma_pos_x", "sigma_pos_y").to_numpy()
+    assert len(ring) == len(at)
+    for strip, centre, sd in zip(ring[:, 0], at, sigma, strict=True):
+        squared = np.sum(((strip[:, :2] - centre) / sd) ** 2, axis=1)
+        np.testing.assert_allclose(squared, chi2.ppf(0.95, 2), rtol=1e-4)
+
+
+def test_a_picture_of_the_floor_lies_where_it_says_and_a_broken_one_is_named(tmp_path: Path) -> None:
+    from marcha.viz.floor import floor_plan, loaders_of
+
+    from .viz_walks import indoor, with_picture
+
+    indoor(tmp_path / "a.mcap")
+    rec = with_picture(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    plan = floor_plan(loaders_of(rec))
+    assert plan.corners == (0.0, 13.0, 0.0, 8.0)
+    assert plan.picture is not None
+    assert plan.picture[0, 0].tolist() == [250, 90, 90]
+    assert set(plan.anchors) == {f"00:00:00:00:00:0{i}" for i in range(1, 5)}
+    with pytest.warns(UserWarning, match=r"attachment anchors\.csv: not drawn"):
+        assert floor_plan({"anchors.csv": lambda: b"mac,x\n1,2\n"}).anchors == {}
+
+
+def test_a_plan_in_degrees_is_laid_out_in_metres() -> None:
+    import json
+
+    from marcha.viz.floor import floor_plan
+
+    corner, step = (121.5, 31.2), 0.001
+    ring = [[corner[0], corner[1]], [corner[0] + step, corner[1]], [corner[0] + step, corner[1] + step]]
+    shape = {"type": "Feature", "geometry": {"type": "LineString", "coordinates": ring}}
+    (line,) = floor_plan({"plan.geojson": lambda: json.dumps(shape).encode()}).outlines
+    from pyproj import Geod
+
+    _, _, east = Geod(ellps="WGS84").inv(*ring[0], *ring[1])
+    _, _, north = Geod(ellps="WGS84").inv(*ring[1], *ring[2])
+    np.testing.assert_allclose(line, [[0, 0], [east, 0], [east, north]], rtol=1e-4, atol=1e-9)
+
+
+def test_a_joint_s_error_is_estimate_minus_reference_within_its_band(tmp_path: Path) -> None:
+    from .test_viz_rrd import column
+    from .viz_walks import leg
+
+    rec = leg(tmp_path / "a.mcap")
+    assert unseen(rec, tmp_path) == []
+    path = tmp_path / "drawn.rrd"
+    t_ns, error = column(path, "/run/joint_smea/joint/knee/error", "Scalars:scalars")
+    np.testing.assert_allclose(error[:, 0], 1.5 * np.sin(t_ns / 1e9), atol=0.1)  # not the encoder's 1.7°
+    _, variance = column(path, "/run/joint_smea/sigma/knee/band", "Measurements:variances")
+    np.testing.assert_allclose(np.sqrt(variance), 1.2, rtol=1e-6)
+    _, error = column(path, "/run/joint_smea/attitude/thigh_roll/error", "Scalars:scalars")
+    assert np.abs(error).max() < 0.1
+
+
+def test_a_segment_hangs_at_the_end_of_the_one_above(tmp_path: Path) -> None:
+    from .test_viz_rrd import column
+    from .viz_walks import leg
+
+    rec = leg(tmp_path / "a.mcap")
+    viz.write_rrd(rec, tmp_path / "a.rrd")
+    t_ns, at = column(tmp_path / "a.rrd", "/reference/figure/shank", "Transform3D:translation")
+    s = t_ns / 1e9
+    thigh = np.radians(25.0) * np.sin(2 * np.pi * 0.8 * s)
+    knee = np.column_stack([0 * s, 0.42 * np.sin(thigh), -0.42 * np.cos(thigh)])
+    np.testing.assert_allclose(at[:, 0], knee, atol=1e-5)
+
+
+def test_jump_states_and_what_is_used_are_lanes(tmp_path: Path) -> None:
+    from .test_viz_rrd import column
+    from .viz_walks import leg
+
+    rec = leg(tmp_path / "a.mcap")
+    viz.write_rrd(rec, tmp_path / "a.rrd")
+    _, state = column(tmp_path / "a.rrd", "/run/joint_smea/jump/state", "StateChange:state")
+    assert set(state[:, 0]) == {"thigh", "shank", "all", ""}
+    _, used = column(tmp_path / "a.rrd", "/run/joint_smea/use/thigh", "StateChange:state")
+    assert set(used[:, 0]) == {"used", ""}

@@ -25,7 +25,7 @@ ANCHORS = {
 }
 
 
-def xyz(prefix: str, values: Floats) -> dict[str, Floats]:
+def xyz(prefix: str, values: NDArray[Any]) -> dict[str, NDArray[Any]]:
     return {f"{prefix}_{a}": values[:, i] for i, a in enumerate("xyz")}
 
 

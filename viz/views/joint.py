@@ -160,11 +160,13 @@ def difference(own: Curve, truth: Curve) -> tuple[Times, Floats]:
     """Return times (n,) and estimate minus reference (n,), ° in [−180, 180), where both are known."""
     t, v = own.finite()
     t_ref, v_ref = truth.finite()
-    found = match(t, t_ref, MAX_GAP_S)
-    if not len(found.index):
-        return np.empty(0, np.int64), np.empty(0)
-    error = v[found.index] - found.linear(v_ref[:, None])[:, 0]
-    return t[found.index], (error + 180.0) % 360.0 - 180.0
+    if len(t_ref) < len(t):  # the denser one is interpolated, at the times of the sparser one
+        found = match(t_ref, t, MAX_GAP_S)
+        at, error = t_ref[found.index], found.linear(v[:, None])[:, 0] - v_ref[found.index]
+    else:
+        found = match(t, t_ref, MAX_GAP_S)
+        at, error = t[found.index], v[found.index] - found.linear(v_ref[:, None])[:, 0]
+    return at, (error + 180.0) % 360.0 - 180.0
 
 
 class AngleSigma(Values):
@@ -249,7 +251,7 @@ class Orientation(View):
         self.at = f"{self.figure}/{slug(self.segment)}"
         ends = np.array([[0.0, 0.0, 0.0], self.bone], dtype=np.float32)
         rgb = style.rgb(color)
-        bone = rr.LineStrips3D([ends], colors=rgb, radii=0.02 if self.role != "reference" else 0.03)
+        bone = rr.LineStrips3D([ends], colors=rgb, radii=0.02 if self.role != "reference" else 0.012)
         canvas.static(f"{self.at}/bone", bone)
         canvas.static(f"{self.at}/axes", rr.TransformAxes3D(0.12))
         label = rr.Points3D([ends[1] * 0.5], labels=[self.segment], colors=rgb, radii=0.005, show_labels=True)
