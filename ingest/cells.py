@@ -94,7 +94,7 @@ class Cells:
             if b"\r" in piece:
                 piece = piece.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
             if self._layout.separator == "blanks":
-                piece = re.sub(rb"[ \t]+", b"\t", re.sub(rb"(?m)^[ \t]+|[ \t]+$", b"", piece))
+                piece = re.sub(rb"(?m)^\t|\t$", b"", re.sub(rb"[ \t]+", b"\t", piece))
             yield piece, piece.count(b"\n") + (not piece.endswith(b"\n"))
 
     def _first_row(self, block: bytes) -> bytes:

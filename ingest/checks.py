@@ -173,6 +173,8 @@ class SensorCheck:
             if v.max() < high and v.min() > low:
                 continue
             at = np.flatnonzero((v >= high) | (v <= low))
+            if not at.size:  # a missing cell makes the extremes NaN
+                continue
             self._report.loss(
                 "clipped",
                 f"{self._subject} {name}: at full scale (±{text}); the true value is beyond it",

@@ -215,11 +215,14 @@ class Clock:
 
     def _is_cut(self, piece: Int64Array, upcoming: int) -> bool:
         """Whether the only row of ``piece`` carries the last digits of the time that should stand there."""
-        nominal = self._nominal or 1
-        end = str(int(piece[0]))
-        return piece.size == 1 and any(
-            str(upcoming - d).endswith(end) for d in range(max(1, nominal // 2), 2 * nominal + 1)
-        )
+        if piece.size != 1 or piece[0] < 0:
+            return False
+        nominal, digits = self._nominal or 1, int(piece[0])
+        least, most = max(1, nominal // 2), 2 * nominal
+        modulus = 10 ** len(str(digits))
+        return (
+            least + (upcoming - digits - least) % modulus <= most
+        )  # the first distance with these last digits
 
     def _slip(self, ticks: Int64Array, lines: Int64Array, a: int, b: int, last: int | None) -> None:
         off = int(ticks[a]) - (last or 0)

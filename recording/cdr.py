@@ -25,6 +25,12 @@ _ENCAPSULATION_WORD = {order: int.from_bytes(head, "little") for head, order in 
 MAX_LEAVES = 4096
 """A message with more leaves than this (a point cloud of structures) has no columns."""
 
+MAX_BYTES = 1 << 28
+"""Largest fixed-size message that has columns."""
+
+MAX_DEPTH = 32
+"""Types within types: a definition that holds itself ends here."""
+
 Bytes = NDArray[np.uint8]
 
 
@@ -79,6 +85,8 @@ class Layout:
         self._at += -(self._at - 4) % align
         if len(self._names) >= MAX_LEAVES:
             raise CdrError(f"more than {MAX_LEAVES} values in one message")
+        if self._at + size > MAX_BYTES:
+            raise CdrError(f"{path}: one message would have more than {MAX_BYTES} bytes")
         self._names.append(path)
         self._formats.append(format_)
         self._offsets.append(self._at)
@@ -91,6 +99,8 @@ class Layout:
         return count
 
     def _walk(self, prefix: str, definition: Definition) -> None:
+        if prefix.count(".") > MAX_DEPTH:
+            raise CdrError(f"{prefix[:80]}…: types lie more than {MAX_DEPTH} deep within one another")
         for field in definition.fields:
             path = prefix + field.name
             length = field.length
@@ -110,6 +120,8 @@ class Layout:
                 continue
             if field.type == "wstring":
                 raise CdrError(f"{path}: wide strings are not supported")
+            if length is not None and length > MAX_LEAVES:
+                raise CdrError(f"{path}: {length} values; at most {MAX_LEAVES}")
             for i in range(1 if length is None else length):
                 item = path if length is None else f"{path}[{i}]"
                 if field.type == "string":

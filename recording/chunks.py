@@ -421,6 +421,9 @@ def _decompress(compression: str, body: memoryview, size: int, reuse: bool) -> b
         decompressor = getattr(_local, "zstd", None)
         if decompressor is None:
             decompressor = _local.zstd = zstandard.ZstdDecompressor()
+        stated = zstandard.frame_content_size(body) if len(body) else 0
+        if stated > size:  # it would be allocated as the frame says, not as the chunk does
+            raise ValueError(f"{stated} bytes, {size} stated")
         if not reuse:
             return decompressor.decompress(body, max_output_size=size) if size else b""
         with decompressor.stream_reader(body, read_size=max(1, len(body))) as stream:
@@ -428,7 +431,7 @@ def _decompress(compression: str, body: memoryview, size: int, reuse: bool) -> b
     if compression == "lz4":
         import lz4.frame
 
-        return lz4.frame.decompress(body)
+        return lz4.frame.LZ4FrameDecompressor().decompress(body, max_length=size + 1)
     raise ValueError("unknown compression")
 
 
