@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator
+from hashlib import blake2b
 from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar
@@ -14,11 +15,12 @@ import polars as pl
 from ..recording import SCHEMAS, Channel, Recording
 from ..recording.selection import Selection, selected_topics, within
 from .events import COLUMNS as EVENT_COLUMNS
-from .events import to_events
+from .events import events_text, sidecar, to_events
+from .facts import pretty
 from .folder import MARKER, whole_folder
 
 EVENT = "foxglove_msgs/msg/Event"
-EVENTS = "events.tsv"
+EVENTS, EVENTS_JSON = "events.tsv", "events.json"
 README = "README.txt"
 COMMON_COLUMNS = {
     "t_ns": "ns, time that the row speaks of",
@@ -39,6 +41,11 @@ class TableExporter:
     def write(self, stream: pl.LazyFrame, file: Path, about: dict[str, str]) -> None:
         """Write ``stream`` to ``file`` with bounded memory, and the facts ``about`` it where it can."""
 
+    def losses(self, rec: Recording, options: Any) -> list[str]:
+        """Return nothing: tables hold every value, and the sidecar what is said of them."""
+        selected_topics(rec, options)
+        return []
+
     def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:
         """Write a folder; see :class:`marcha.export.Exporter`."""
         topics = [t for t in selected_topics(rec, options) if rec.channels[t].schema != EVENT]
@@ -47,16 +54,23 @@ class TableExporter:
             entries = []
             for topic in topics:
                 channel = rec.channels[topic]
-                about = {"topic": topic, "schema": channel.schema, "frame_id": channel.frame_id}
+                about = {
+                    "topic": topic,
+                    "schema": channel.schema,
+                    "frame_id": channel.frame_id,
+                    "start_ns": str(rec.start_ns),
+                    **{f"unit.{c}": meaning(channel.schema, c)["unit"] for c in _columns(channel)},
+                }
                 rows = self._write_channel(_Stream(rec, topic, options), folder / names[topic], about)
                 entries.append(_describe(channel, names[topic], rows))
             written = [names[topic] for topic in topics]
             events = _events(rec, options)
             if events.height:
-                events.write_csv(folder / EVENTS, separator="\t")
-                written.append(EVENTS)
+                (folder / EVENTS).write_text(events_text(events), encoding="utf-8", newline="\n")
+                (folder / EVENTS_JSON).write_bytes(pretty(sidecar(rec.metadata)))
+                written += [EVENTS, EVENTS_JSON]
             attached = _attachments(rec, folder)
-            sidecar = {
+            document = {
                 "source": rec.path.name,
                 "start_ns": rec.start_ns,
                 "end_ns": rec.end_ns,
@@ -65,7 +79,7 @@ class TableExporter:
                 "metadata": rec.metadata,
                 "attachments": attached,
             }
-            encoded = msgspec.json.format(msgspec.json.encode(sidecar), indent=2)
+            encoded = msgspec.json.format(msgspec.json.encode(document), indent=2)
             (folder / MARKER).write_bytes(encoded + b"\n")
             (folder / README).write_text(
                 _readme(rec, entries, bool(events.height), attached), encoding="utf-8"
@@ -168,6 +182,7 @@ def _file_names(topics: list[str], suffix: str) -> dict[str, str]:
     taken: set[str] = set()
     for topic in topics:
         stem = "".join(c if c.isalnum() or c in "-_." else "_" for c in topic.strip("/")) or "channel"
+        stem = _short(stem if stem[0] != "." else f"_{stem}")
         name, number = stem, 1
         while name.lower() in taken:
             number += 1
@@ -185,7 +200,7 @@ def _describe(channel: Channel, file: str, rows: int) -> dict[str, Any]:
         "schema": channel.schema,
         "frame_id": channel.frame_id,
         "rows": rows,
-        "columns": [{"name": name, **_meaning(channel.schema, name)} for name in _columns(channel)],
+        "columns": [{"name": name, **meaning(channel.schema, name)} for name in _columns(channel)],
         "metadata": dict(channel.metadata),
     }
 
@@ -194,7 +209,7 @@ def _columns(channel: Channel) -> list[str]:
     return [*COMMON_COLUMNS, *(c for c in channel.columns if c not in COMMON_COLUMNS)]
 
 
-def _meaning(schema: str, column: str) -> dict[str, str]:
+def meaning(schema: str, column: str) -> dict[str, str]:
     """Return unit and meaning of a column; in a schema whose columns carry names, the suffix decides."""
     if column in COMMON_COLUMNS:
         unit, _, doc = COMMON_COLUMNS[column].partition(", ")
@@ -217,14 +232,44 @@ def _events(rec: Recording, options: Selection) -> pl.DataFrame:
 def _attachments(rec: Recording, folder: Path) -> list[str]:
     """Copy the attachments into ``attachments/``; return their names in the folder. None can leave it."""
     written: list[str] = []
+    taken: set[str] = set()
     for attachment in rec.attachments:
         parts = [p for p in attachment.name.replace("\\", "/").split("/") if p not in ("", ".", "..")]
-        name = "/".join(("attachments", *(parts or ["attachment"])))
+        name = _free_name("/".join(("attachments", *map(_short, parts or ["attachment"]))), taken)
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(rec.attachment(attachment.name))
         written.append(name)
     return written
+
+
+def _free_name(name: str, taken: set[str]) -> str:
+    """Return a name that is no other's, nor the folder of another; both are reserved (``a`` and ``a/b``)."""
+    free, number = name, 1
+    while free.lower() in taken or f"{free.lower()}/" in taken or any(f in taken for f in _folders(free)):
+        number += 1
+        head, slash, last = name.rpartition("/")
+        blocked = any(f in taken for f in _folders(name))
+        free = f"{head}_{number}{slash}{last}" if blocked else f"{name}_{number}"
+    taken.add(free.lower())
+    taken.update(f"{f}/" for f in _folders(free))
+    return free
+
+
+def _folders(name: str) -> list[str]:
+    lower = name.lower()
+    return [lower[:i] for i, c in enumerate(lower) if c == "/"]
+
+
+def _short(name: str, most: int = 200) -> str:
+    """Return a name that file systems take: without control characters, at most 200 bytes long."""
+    name = "".join(c if c.isprintable() else "_" for c in name)
+    if len(name.encode()) <= most:
+        return name
+    stem, dot, suffix = name.rpartition(".")
+    suffix = dot + suffix if stem and len(suffix) <= 10 else ""
+    kept = name.removesuffix(suffix).encode()[: most - len(suffix.encode()) - 9].decode("utf-8", "ignore")
+    return f"{kept}_{blake2b(name.encode(), digest_size=4).hexdigest()}{suffix}"
 
 
 def _readme(rec: Recording, entries: list[dict[str, Any]], events: bool, attached: list[str]) -> str:

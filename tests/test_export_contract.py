@@ -29,6 +29,46 @@ class TestRrd(ExporterContract):
     name = "rrd"
 
 
+class TestBids(ExporterContract):
+    name = "bids"
+
+
+class TestGpx(ExporterContract):
+    name = "gpx"
+
+
+class TestGeoJson(ExporterContract):
+    name = "geojson"
+
+
+class TestKml(ExporterContract):
+    name = "kml"
+
+
+class TestSto(ExporterContract):
+    name = "sto"
+
+
+class TestMot(ExporterContract):
+    name = "mot"
+
+
+class TestTrc(ExporterContract):
+    name = "trc"
+
+
+class TestC3d(ExporterContract):
+    name = "c3d"
+
+
+class TestMatlab(ExporterContract):
+    name = "matlab"
+
+
+class TestRos2Bag(ExporterContract):
+    name = "ros2bag"
+
+
 class TestEvents(ExporterContract):
     name = "events"
 

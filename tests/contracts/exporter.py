@@ -21,8 +21,8 @@ ROWS = 3000
 def example(path: Path) -> Path:
     """Write a small recording with all that an exporter must cope with; return its path.
 
-    Two sensors at different rates, an estimate that was known later than it speaks of, a channel without a
-    message, annotations, metadata and an attachment.
+    Sensors at different rates, fixes, markers, a joint, a reference, an estimate that was known later than it
+    speaks of, a channel without a message, annotations, metadata and an attachment.
     """
     t_ns = START_NS + 10_000_000 * np.arange(ROWS, dtype=np.int64)
     wave = np.sin(np.arange(ROWS) / 7.0)
@@ -30,6 +30,22 @@ def example(path: Path) -> Path:
         {"t_ns": t_ns, **{f"{s}_{a}": wave * k for s in ("acc", "gyr") for k, a in enumerate("xyz", 1)}}
     )
     mag = pl.DataFrame({"t_ns": t_ns[::5], **{f"mag_{a}": wave[::5] * 1e-5 for a in "xyz"}})
+    fix = pl.DataFrame(
+        {"t_ns": t_ns[::100], "lat_deg": 38.7 + 1e-6 * wave[::100], "lon_deg": -9.1 + 2e-6 * wave[::100]}
+    )
+    markers = pl.DataFrame({"t_ns": t_ns[::2], **{f"heel.{a}": wave[::2] for a in "xyz"}})
+    joint = pl.DataFrame({"t_ns": t_ns[::2], "knee": 0.5 * wave[::2]})
+    half = np.arcsin(0.5 * wave)
+    pose = pl.DataFrame(
+        {
+            "t_ns": t_ns,
+            **{f"pos_{a}": wave for a in "xyz"},
+            "quat_w": np.cos(half),
+            "quat_x": np.sin(half),
+            "quat_y": 0.0 * half,
+            "quat_z": 0.0 * half,
+        }
+    )
     stance = pl.DataFrame({"t_ns": t_ns[:-10], "t_log_ns": t_ns[10:], "still": wave[:-10] > 0})
     notes = pl.DataFrame(
         {
@@ -44,6 +60,10 @@ def example(path: Path) -> Path:
         out.add_table("/foot/imu1", "sensor_msgs/msg/Imu", imu, frame_id="imu1")
         out.add_table("/foot/mag", "sensor_msgs/msg/MagneticField", mag, frame_id="imu1")
         out.add_table("/estimate/mine/stance", "marcha_msgs/msg/Stance", stance, frame_id="imu1")
+        out.add_table("/phone/gnss", "sensor_msgs/msg/NavSatFix", fix)
+        out.add_table("/reference/markers", "marcha_msgs/msg/OpticalMarkers", markers, frame_id="lab")
+        out.add_table("/leg/encoder", "sensor_msgs/msg/JointState", joint)
+        out.add_table("/reference/pose", "geometry_msgs/msg/PoseStamped", pose, frame_id="nav")
         out.add_channel("/empty", "sensor_msgs/msg/Temperature", columns=("temperature_c",))
         out.add_annotations(notes)
         out.add_metadata("device", {"clock": "unix", "name": "example"})

@@ -1,0 +1,334 @@
+"""Motion-BIDS (BEP 029): readings as raw data, estimates as derivatives, annotations as events."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+import msgspec
+import polars as pl
+
+from ..recording import Recording
+from ..recording.errors import UsageError
+from ..recording.selection import Selection, selected_topics, within
+from .events import events_text, sidecar, to_events
+from .facts import origin, pretty
+from .folder import whole_folder
+from .labels.side import plain
+from .series import rate_hz
+from .tables import EVENT, meaning
+
+VERSION = "1.9.0"
+ESTIMATE = "/estimate/"
+MARKER = "dataset_description.json"
+_EPOCH_NS = 946_684_800 * 10**9
+_KINDS = {"acc": "ACCEL", "gyr": "GYRO", "mag": "MAGN", "quat": "ORNT", "pos": "POS", "vel": "VEL"}
+_UNITS = {"m/s²": "m/s^2", "°": "deg", "°C": "oC", "-": "n/a", "": "n/a", "as named": "n/a", "Pa": "Pa"}
+_COUNTED = ("ACCEL", "GYRO", "MAGN", "ORNT", "POS", "VEL", "JNTANG", "LATENCY", "MISC")
+
+
+class BidsOptions(Selection, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Options of a BIDS dataset."""
+
+    subject: Annotated[
+        str, msgspec.Meta(pattern="^[0-9a-zA-Z]+$", description="sub-…: letters and digits")
+    ] = "01"
+    session: Annotated[str, msgspec.Meta(pattern="^[0-9a-zA-Z]*$", description="ses-…; none where empty")] = (
+        ""
+    )
+    task: Annotated[str, msgspec.Meta(pattern="^[0-9a-zA-Z]+$", description="task-…")] = "walk"
+    run: Annotated[str, msgspec.Meta(pattern="^[0-9]*$", description="run-…; none where empty")] = ""
+    derivatives: Annotated[bool, msgspec.Meta(description="write estimates below derivatives/marcha")] = True
+    license: Annotated[str, msgspec.Meta(description="licence of the data, as SPDX")] = "n/a"
+
+
+class System(NamedTuple):
+    """Channels that share their times: a tracking system of its own."""
+
+    label: str
+    name: str
+    topics: list[str]
+
+
+class BidsExporter:
+    """A Motion-BIDS dataset of one recording; :func:`write_dataset` writes one of many."""
+
+    name: ClassVar[str] = "bids"
+    title: ClassVar[str] = "Motion-BIDS dataset: raw, derivatives, events (reviewers, data archives)"
+    suffix: ClassVar[str] = ""
+    Options: ClassVar[type[msgspec.Struct]] = BidsOptions
+
+    def losses(self, rec: Recording, options: Any) -> list[str]:
+        """Return what the dataset has no place for; it is in marcha.json beside it or named there."""
+        odd = [
+            t
+            for t in selected_topics(rec, options)
+            if rec.channels[t].schema != EVENT and not numeric_columns(rec, t)
+        ]
+        said = ["line breaks and tabs in labels: they are written as signs"]
+        if odd:
+            said.append(f"channels without numbers: {', '.join(odd)}")
+        if rec.attachments:
+            said.append(f"{len(rec.attachments)} attachments")
+        return said
+
+    def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:
+        """Write the dataset; see :class:`marcha.export.Exporter`."""
+        return write_dataset({rec: options}, path, overwrite=overwrite)
+
+
+def write_dataset(
+    recordings: Mapping[Recording, BidsOptions], path: Path, *, overwrite: bool = False
+) -> list[Path]:
+    """Write a dataset of one or many recordings.
+
+    Parameters
+    ----------
+    recordings : mapping of Recording to BidsOptions
+        Each with its own subject, session, task or run.
+    path : Path
+        The folder.
+    overwrite : bool
+        Whether an earlier dataset that marcha wrote may be replaced.
+
+    Returns
+    -------
+    list of Path
+        The files.
+
+    Raises
+    ------
+    UsageError
+        Two recordings have the same entities, or one has nothing to write.
+    """
+    stems = [f"{_stem(o)} {o.run}" for o in recordings.values()]
+    if len(set(stems)) != len(stems):
+        raise UsageError(f"{path}: two recordings would have one name; give each its subject, session or run")
+    with whole_folder(path, overwrite=overwrite, marker=MARKER) as folder:
+        files = _Files(folder)
+        about = {}
+        licenses = {o.license for o in recordings.values()} - {"n/a"}
+        derived = [_write_recording(files, rec, o, about) for rec, o in recordings.items()]
+        _describe(files, "", "raw", licenses)
+        if any(derived):
+            _describe(files, "derivatives/marcha/", "derivative", licenses)
+        for name, rows in files.scans.items():
+            table = pl.DataFrame(rows, schema=["filename", "acq_time"], orient="row")
+            files.text(name, table.write_csv(separator="\t"))
+        subjects = sorted({f"sub-{o.subject}" for o in recordings.values()})
+        table = pl.DataFrame({"participant_id": subjects})
+        files.text("participants.tsv", table.write_csv(separator="\t"))
+        files.json("participants.json", {"participant_id": {"Description": "subject"}})
+        files.json("sourcedata/marcha.json", about)
+    return [path / name for name in files.names]
+
+
+class _Files:
+    """The files of a dataset, by their names in it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.names: list[str] = []
+        self.scans: dict[str, list[tuple[str, str]]] = {}
+
+    def place(self, name: str) -> Path:
+        path = self.folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self.names.append(name)
+        return path
+
+    def text(self, name: str, text: str) -> None:
+        self.place(name).write_text(text, encoding="utf-8", newline="\n")
+
+    def json(self, name: str, value: Any) -> None:
+        self.place(name).write_bytes(pretty(value))
+
+
+def _stem(options: BidsOptions) -> str:
+    parts = [f"sub-{options.subject}"]
+    parts += [f"ses-{options.session}"] if options.session else []
+    return "_".join([*parts, f"task-{options.task}"])
+
+
+def _describe(files: _Files, base: str, kind: str, licenses: set[str]) -> None:
+    facts: dict[str, Any] = {
+        "Name": "Walks recorded with inertial sensors" if kind == "raw" else "Estimates of marcha",
+        "BIDSVersion": VERSION,
+        "DatasetType": kind,
+        "License": " AND ".join(sorted(licenses)) or "n/a",
+        "GeneratedBy": [{"Name": "marcha", "Version": version("marcha")}],
+    }
+    if kind == "derivative":
+        facts["SourceDatasets"] = [{"URL": "../../"}]
+    files.json(f"{base}dataset_description.json", facts)
+    text = (
+        "Walks recorded with inertial sensors and references, written by marcha as Motion-BIDS.\n\n"
+        "Times count from the start of each recording; the LATENCY channel has the exact time of each row.\n"
+        "Quaternions have their real part first and take coordinates from the sensor to the navigation frame.\n"
+    )
+    files.text(f"{base}README", text if kind == "raw" else "Estimates that marcha made of the raw data.\n")
+
+
+def _write_recording(files: _Files, rec: Recording, options: BidsOptions, about: dict[str, Any]) -> bool:
+    """Write one recording; return whether it has derivatives."""
+    topics = [
+        t
+        for t in selected_topics(rec, options)
+        if rec.channels[t].schema != EVENT and rec.channels[t].count and numeric_columns(rec, t)
+    ]
+    raw = [t for t in topics if not t.startswith(ESTIMATE)]
+    own = [t for t in topics if t.startswith(ESTIMATE)] if options.derivatives else []
+    if not raw:
+        raise UsageError(f"{rec.path}: no chosen channel has readings for a BIDS dataset")
+    session = f"/ses-{options.session}" if options.session else ""
+    folder = f"sub-{options.subject}{session}/motion/"
+    run = f"_run-{options.run}" if options.run else ""
+    stem = _stem(options)
+    scans = []
+    for base, chosen in (("", raw), ("derivatives/marcha/", own)):
+        for system in systems(rec, chosen, options):
+            name = f"{stem}_tracksys-{system.label}{run}"
+            if base:
+                name += "_desc-estimate"
+            _write_system(files, rec, options, system, f"{base}{folder}{name}")
+            if not base:
+                scans.append(f"motion/{name}_motion.tsv")
+    events = to_events(within(rec.annotations, options), rec.start_ns)
+    if events.height:
+        texts = [c for c, dtype in events.schema.items() if dtype == pl.String]
+        events = events.with_columns(
+            pl.col(c).map_elements(plain, pl.String).str.replace_all('"', "″", literal=True) for c in texts
+        )
+        files.text(f"{folder}{stem}{run}_events.tsv", events_text(events))
+        files.json(f"{folder}{stem}{run}_events.json", sidecar(rec.metadata))
+    base = f"sub-{options.subject}{session}"
+    files.scans.setdefault(f"{base}/{base.replace('/', '_')}_scans.tsv", []).extend(
+        (name, _date(rec)) for name in scans
+    )
+    about[f"{stem}{run}"] = {**origin(rec), "metadata": rec.metadata}
+    return bool(own)
+
+
+def _date(rec: Recording) -> str:
+    if rec.start_ns < _EPOCH_NS:
+        return "n/a"
+    whole, rest = divmod(rec.start_ns, 10**9)
+    return datetime.fromtimestamp(whole, UTC).strftime("%Y-%m-%dT%H:%M:%S") + f".{rest // 1000:06d}Z"
+
+
+def numeric_columns(rec: Recording, topic: str) -> list[str]:
+    """Return the columns of a channel that are numbers, without times of the clock."""
+    empty = rec.table(topic, start_ns=0, end_ns=0)
+    return [
+        n for n, d in empty.schema.items() if (d.is_numeric() or d == pl.Boolean) and not n.endswith("_ns")
+    ]
+
+
+def systems(rec: Recording, topics: list[str], options: Selection) -> list[System]:
+    """Return the tracking systems: channels of a device with the same times are one.
+
+    A device is the first part of a topic, a run for estimates.
+    """
+    groups: dict[tuple[str, str], list[str]] = {}
+    for topic in topics:
+        t_ns = rec.table(topic, start_ns=options.start_ns, end_ns=options.end_ns)["t_ns"]
+        parts = topic.strip("/").split("/")
+        device = parts[1] if topic.startswith(ESTIMATE) and len(parts) > 2 else parts[0]
+        key = f"{len(t_ns)}/{t_ns.hash(0).sum()}" if len(t_ns) else ""
+        groups.setdefault((device, key), []).append(topic)
+    out, taken = [], set()
+    for (device, _), members in groups.items():
+        alone = sum(d == device for d, _ in groups) == 1
+        name = device if alone else members[0].strip("/")
+        word = re.sub(r"[^0-9A-Za-z]", "", name) or "system"
+        label, number = word, 1
+        while label.lower() in taken:
+            number += 1
+            label = f"{word}{number}"
+        taken.add(label.lower())
+        out.append(System(label, name, members))
+    return out
+
+
+def _write_system(files: _Files, rec: Recording, options: BidsOptions, system: System, stem: str) -> None:
+    tables = {t: rec.table(t, start_ns=options.start_ns, end_ns=options.end_ns) for t in system.topics}
+    t_ns = next(iter(tables.values()))["t_ns"].to_numpy()
+    rate = rate_hz(t_ns)
+    columns: dict[str, Any] = {"latency": pl.Series((t_ns - rec.start_ns) / 1e9)}
+    rows = [("latency", "n/a", "LATENCY", "n/a", "s", "n/a", rate, "time since the start of the recording")]
+    for topic, table in tables.items():
+        schema = rec.channels[topic].schema
+        for column in numeric_columns(rec, topic):
+            group, _, axis = column.rpartition("_")
+            known = _KINDS.get(group)
+            joint = schema == "sensor_msgs/msg/JointState"
+            kind = "JNTANG" if joint and not column.endswith((".vel", ".effort")) else known or "MISC"
+            component = axis if axis in ("x", "y", "z") else "n/a"
+            if known == "ORNT":
+                component = f"quat_{axis}"
+            about = meaning(schema, column)
+            unit = _UNITS.get(about["unit"], about["unit"])
+            frame = rec.channels[topic].frame_id or "n/a"
+            name = f"{topic.strip('/').replace('/', '_')}_{column}"
+            values = table[column]
+            columns[name] = values.cast(pl.Int8) if values.dtype == pl.Boolean else values
+            if kind == "ORNT":
+                unit = "n/a"
+            rows.append(
+                (name, component, kind, topic.strip("/"), unit, _frame(frame), rate, about["meaning"])
+            )
+    data = pl.DataFrame(columns).with_columns(pl.selectors.float().fill_nan(None))
+    data.write_csv(
+        files.place(f"{stem}_motion.tsv"),
+        separator="\t",
+        include_header=False,
+        null_value="n/a",
+        float_scientific=None,
+    )
+    heads = [
+        "name",
+        "component",
+        "type",
+        "tracked_point",
+        "units",
+        "reference_frame",
+        "sampling_frequency",
+        "description",
+    ]
+    listing = pl.DataFrame([tuple(r) for r in rows], schema=heads, orient="row")
+    channels_stem = stem
+    files.text(f"{channels_stem}_channels.tsv", listing.write_csv(separator="\t", null_value="n/a"))
+    frames = sorted({r[5] for r in rows} - {"n/a"})
+    if frames:
+        levels = {
+            f: {
+                "SpatialAxes": "n/a",
+                "RotationRule": "right-hand",
+                "RotationOrder": "n/a",
+                "Description": f"frame {f} of the recording",
+            }
+            for f in frames
+        }
+        files.json(f"{channels_stem}_channels.json", {"reference_frame": {"Levels": levels}})
+    kinds = [r[2] for r in rows]
+    facts: dict[str, Any] = {
+        "TaskName": options.task,
+        "SamplingFrequency": rate,
+        "SamplingFrequencyEffective": rate,
+        "TrackingSystemName": system.name,
+        "MotionChannelCount": len(rows),
+        "TrackedPointsCount": len(tables),
+        "RecordingDuration": float((t_ns[-1] - t_ns[0]) / 1e9),
+        "MissingValues": "n/a",
+        "RecordingType": "continuous",
+        **{f"{k}ChannelCount": kinds.count(k) for k in _COUNTED if k in kinds},
+    }
+    files.json(f"{stem}_motion.json", facts)
+
+
+def _frame(frame_id: str) -> str:
+    return re.sub(r"[^0-9A-Za-z_]", "_", frame_id) if frame_id != "n/a" else "n/a"
