@@ -248,9 +248,8 @@ def _free_name(name: str, taken: set[str]) -> str:
     free, number = name, 1
     while free.lower() in taken or f"{free.lower()}/" in taken or any(f in taken for f in _folders(free)):
         number += 1
-        head, slash, last = name.rpartition("/")
-        blocked = any(f in taken for f in _folders(name))
-        free = f"{head}_{number}{slash}{last}" if blocked else f"{name}_{number}"
+        blocked = next((f for f in _folders(name) if f in taken), name)  # the first folder that is a file
+        free = f"{name[: len(blocked)]}_{number}{name[len(blocked) :]}"
     taken.add(free.lower())
     taken.update(f"{f}/" for f in _folders(free))
     return free

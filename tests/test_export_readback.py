@@ -232,12 +232,12 @@ def test_bids_counts_rates_and_values_agree(rec: Recording, tmp_path: Path) -> N
             sum(v for k, v in about.items() if k.endswith("ChannelCount") and k != "MotionChannelCount")
             == rows.width
         )
-        seconds = rows["column_1"].to_numpy()
+        seconds = rows["column_0"].to_numpy()
         assert about["SamplingFrequency"] == pytest.approx((len(seconds) - 1) / (seconds[-1] - seconds[0]))
         assert float(channels["sampling_frequency"][0]) == about["SamplingFrequency"]
     (imu,) = [f for f in found if "tracksys-footimu1_" in f.name]
     rows = pl.read_csv(imu, separator="\t", has_header=False)
-    assert np.array_equal(rows["column_2"].to_numpy(), rec.table("/foot/imu1")["acc_x"].to_numpy())
+    assert np.array_equal(rows["column_1"].to_numpy(), rec.table("/foot/imu1")["acc_x"].to_numpy())
     events = pl.read_csv(next((tmp_path / "ds").rglob("*_events.tsv")), separator="\t", null_values=["n/a"])
     assert events["onset"].is_between(0, rec.duration_s).all()
 
