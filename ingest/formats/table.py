@@ -33,6 +33,8 @@ from ..mapping import (
 
 #: Share of the full scale at which a 16-bit converter says its last count.
 LAST_COUNT = 1 - 1.5 / 32768
+#: Messages whose columns go missing together: one finding a topic.
+TOGETHER = ("marcha_msgs/msg/OpticalMarkers", "geometry_msgs/msg/QuaternionStamped", "geometry_msgs/msg/PoseStamped")
 
 
 class TableOptions(CommonOptions, frozen=True, kw_only=True):
@@ -227,7 +229,7 @@ class _File:
         lines = block["line"]
         columns: dict[str, pl.Series] = {"t": self._ticks(block), "line": lines}
         for topic, found in self._topics:
-            many = schema_name(topic) == "marcha_msgs/msg/OpticalMarkers"  # a gap hides dozens of columns
+            many = schema_name(topic) in TOGETHER
             for name, target, place in found:
                 if place is not None:
                     text = block[f"c{place}"]

@@ -36,6 +36,7 @@ from ..inertial import (
     one_file,
     tables,
 )
+from ..matfile import MAGIC, Variable, read_mat
 
 POSE = ChannelSpec(
     "/reference/pose",
@@ -49,7 +50,6 @@ STANCE = ChannelSpec(
     metadata={"source": "zv_vicon_opt: threshold on the optical speed"},
 )
 POSITION = ("pos_x", "pos_y", "pos_z")
-MAGIC = b"MATLAB 5.0 MAT-file"
 
 
 class ViconOptions(CommonOptions, frozen=True, kw_only=True):
@@ -75,11 +75,9 @@ class ViconMat:
         """A MATLAB file that holds ``imu``, ``gt`` and ``ts``."""
         if not head.startswith(MAGIC):
             return 0.0
-        from scipy.io import whosmat
-
         try:
-            names = {name for name, *_ in whosmat(path)}
-        except Exception:  # a damaged file may raise anything; reading it will say what
+            names = set(read_mat(path))
+        except MarchaError:  # a damaged file: reading it will say what
             return 0.5
         return 0.95 if names >= {"imu", "gt", "ts"} else 0.0
 
@@ -112,16 +110,7 @@ class ViconMat:
 
 def _load(path: Path, mirror: Mirror) -> pl.DataFrame:
     """Return all rows: ``t`` (ns), ``line`` (row, from 1), SI columns, ``still`` where the file has it."""
-    from scipy.io import loadmat
-
-    try:
-        file = loadmat(path, variable_names=["imu", "gt", "ts", "zv_vicon_opt"])
-    except NotImplementedError:
-        raise MarchaError(f"{path}: a MATLAB 7.3 file (HDF5); save it with save(…, '-v7')") from None
-    except OSError as error:
-        raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except Exception as error:  # scipy raises many kinds for damaged files
-        raise MarchaError(f"{path}: not a readable MATLAB file: {str(error).splitlines()[0]}") from error
+    file = read_mat(path, {"imu", "gt", "ts", "zv_vicon_opt"})
     ts = _variable(path, file, "ts").ravel()
     imu = _variable(path, file, "imu")
     gt = _variable(path, file, "gt")
@@ -140,19 +129,19 @@ def _load(path: Path, mirror: Mirror) -> pl.DataFrame:
         raise MarchaError(f"{path}: ts[{lost[0]}] is {ts[lost[0]]}; every row needs a time")
     columns: dict[str, Any] = {"t": np.round(ts * 1e9).astype(np.int64), "line": np.arange(1, ts.size + 1)}
     columns |= dict(zip((*ACC, *GYR), imu.T, strict=True)) | dict(zip(POSITION, gt.T, strict=True))
-    stance = file.get("zv_vicon_opt")
+    stance = file["zv_vicon_opt"].values if "zv_vicon_opt" in file else None
     if stance is not None and stance.size == ts.size:
-        columns["still"] = stance.ravel().astype(float)
+        columns["still"] = stance.ravel()
     return pl.DataFrame(columns)
 
 
-def _variable(path: Path, file: dict[str, Any], name: str) -> np.ndarray:
-    value = file.get(name)
-    if value is None:
+def _variable(path: Path, file: dict[str, Variable], name: str) -> np.ndarray:
+    if name not in file:
         raise MarchaError(f"{path}: no variable {name!r}; the format needs imu, gt and ts")
-    if not isinstance(value, np.ndarray) or not np.issubdtype(value.dtype, np.number) or value.ndim != 2:
+    value = file[name].values
+    if value is None or value.ndim != 2:
         raise MarchaError(f"{path}: variable {name!r} is no table of numbers")
-    return value.astype(float)
+    return value
 
 
 def _reference(

@@ -1,0 +1,166 @@
+"""Tables of joint angles: OpenSim's MOT and STO (also orientations as quaternions), and CSV with units in its names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, ClassVar, Literal
+
+import msgspec
+import numpy as np
+import polars as pl
+
+from ...recording.errors import MarchaError
+from ..contract import ChannelSpec, CommonOptions, Import, ReportBuilder
+from ..leg import JOINT_TOPIC, JOINTS, ORIENTATION, QUAT, rotations
+from ..legchecks import unwrapped
+from ..optical import FloatArray, blocks_of, float_rows, read_text
+
+_UNIT = re.compile(r"(?P<name>.+?)(?:_(?P<tail>deg|rad)|\s*[(\[](?P<unit>deg|rad|°)[)\]])", re.IGNORECASE)
+_TIME = re.compile(r"(t|time|timestamp)(_s|\s*[(\[]s(ec)?[)\]])?", re.IGNORECASE)
+
+
+class AnglesOptions(CommonOptions, frozen=True, kw_only=True):
+    """Unit of columns whose names do not say it.
+
+    Attributes
+    ----------
+    unit : str or None
+        ``deg`` or ``rad``.
+    """
+
+    unit: Annotated[
+        Literal["deg", "rad"] | None, msgspec.Meta(description="unit of angles whose column does not say it")
+    ] = None
+
+
+class Angles:
+    """Importer ``angles``: ``/reference/joint``, or ``/reference/<segment>/orientation`` of quaternions."""
+
+    name: ClassVar[str] = "angles"
+    title: ClassVar[str] = (
+        "tables of joint angles (OpenSim MOT and STO, CSV with units), or STO of quaternions"
+    )
+    Options = AnglesOptions
+    beside: ClassVar[bool] = True
+
+    def sniff(self, head: bytes, path: Path) -> float:
+        """OpenSim's header, or a time and columns that all say deg or rad."""
+        text = head.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "replace")
+        lines = [x.rstrip() for x in text.replace("\r", "\n").split("\n")]
+        facts, end = _facts(lines)
+        if end is not None:
+            return 0.95 if _speaks(facts) else 0.0
+        cells = _cells(lines[0]) if lines else []
+        named = len(cells) > 1 and _TIME.fullmatch(cells[0]) and all(_UNIT.fullmatch(c) for c in cells[1:])
+        return 0.9 if named else 0.0
+
+    def read(self, paths: Sequence[Path], options: AnglesOptions) -> Import:
+        """Read one file."""
+        path = paths[0]
+        lines = read_text(path).split("\n")
+        facts, end = _facts(lines)
+        if end is None:
+            return _csv(path, lines, options)
+        if not _speaks(facts):
+            raise MarchaError(f"{path}: its header has neither inDegrees nor DataType=Quaternion: no angles")
+        report = ReportBuilder()
+        start = next((k for k in range(end + 1, len(lines)) if lines[k].strip()), None)
+        if start is None:
+            raise MarchaError(f"{path}: ends with its header; nothing to convert")
+        names = lines[start].split()
+        quaternions = facts.get("datatype", "").lower() == "quaternion"
+        if names[:1] != ["time"] or len(names) < 2:
+            raise MarchaError(f"{path}, line {start + 1}: column names must begin with time, not {names[:1]}")
+        columns = ["time", *(f"{n} {a}" for n in names[1:] for a in "wxyz")] if quaternions else names
+        body = [x.replace(",", " ") for x in lines[start + 1 :]] if quaternions else lines[start + 1 :]
+        values, rows = float_rows(path, body, start + 2, " ", columns, report)
+        device = {"clock": "device", "time": "column time (s)", "frames": "as the file has them"}
+        if quaternions:
+            return _orientations(names[1:], values, rows, report, device)
+        degrees = facts.get("indegrees", "").lower() == "yes"
+        factor = {n: np.pi / 180 if degrees and not re.search(r"_t[xyz]$", n) else 1.0 for n in names[1:]}
+        return _joints(names[1:], factor, values, rows, report, device)
+
+
+def _facts(lines: Sequence[str]) -> tuple[dict[str, str], int | None]:
+    """Return ``key=value`` of OpenSim's header in lower case, and the line of ``endheader``; None without."""
+    facts: dict[str, str] = {}
+    for k, line in enumerate(lines[:100]):
+        if line.strip().lower() == "endheader":
+            return facts, k
+        key, mark, value = line.partition("=")
+        if mark:
+            facts[key.strip().lower()] = value.strip()
+    return facts, None
+
+
+def _speaks(facts: dict[str, str]) -> bool:
+    return "indegrees" in facts or facts.get("datatype", "").lower() == "quaternion"
+
+
+def _cells(line: str) -> list[str]:
+    separator = next((c for c in ",;\t" if c in line), ",")
+    return [c.strip().strip('"') for c in line.rstrip(separator + " \r\n").split(separator)]
+
+
+def _csv(path: Path, lines: Sequence[str], options: AnglesOptions) -> Import:
+    cells = _cells(lines[0])
+    if len(cells) < 2 or not _TIME.fullmatch(cells[0]):
+        raise MarchaError(f"{path}, line 1: no header of time (s) and angles, such as time,knee_deg")
+    factor, names = {}, []
+    for cell in cells[1:]:
+        match = _UNIT.fullmatch(cell)
+        unit = (match["tail"] or match["unit"]).lower() if match else options.unit
+        if unit is None:
+            raise MarchaError(
+                f"{path}, line 1: column {cell!r} does not say deg or rad; say it with --set unit=deg"
+            )
+        name = match["name"].strip() if match else cell
+        if name in factor:
+            raise MarchaError(f"{path}, line 1: {name!r} stands twice; rename one of the columns")
+        names.append(name)
+        factor[name] = 1.0 if unit == "rad" else np.pi / 180
+    report = ReportBuilder()
+    separator = next(c for c in ",;\t" if c in lines[0])
+    values, rows = float_rows(path, lines[1:], 2, separator, cells, report)
+    return _joints(names, factor, values, rows, report, {"clock": "device", "time": f"column {cells[0]} (s)"})
+
+
+def _joints(
+    names: Sequence[str],
+    factor: dict[str, float],
+    values: FloatArray,
+    rows: np.ndarray,
+    report: ReportBuilder,
+    device: dict[str, str],
+) -> Import:
+    table = pl.DataFrame({n: values[:, k + 1] * factor[n] for k, n in enumerate(names)})
+    spec = ChannelSpec(
+        JOINT_TOPIC, JOINTS, "", tuple(names), {"source": "table of angles, signs as in the file"}
+    )
+    t_ns = np.rint(values[:, 0] * 1e9).astype(np.int64)
+    blocks = blocks_of(t_ns, rows, [(JOINT_TOPIC, table)], report)
+    return Import(
+        channels=[spec],
+        blocks=unwrapped(blocks, [JOINT_TOPIC], report),
+        report=report,
+        metadata={"device": device},
+    )
+
+
+def _orientations(
+    names: Sequence[str], values: FloatArray, rows: np.ndarray, report: ReportBuilder, device: dict[str, str]
+) -> Import:
+    t_ns = np.rint(values[:, 0] * 1e9).astype(np.int64)
+    specs = [ChannelSpec(f"/reference/{n}/orientation", ORIENTATION, "optical") for n in names]
+    tables = [
+        (s.topic, pl.DataFrame({q: values[:, 1 + 4 * k + j] for j, q in enumerate(QUAT)}))
+        for k, s in enumerate(specs)
+    ]
+    blocks = blocks_of(t_ns, rows, tables, report)
+    topics = [s.topic for s in specs]
+    return Import(
+        channels=specs, blocks=rotations(blocks, topics, report), report=report, metadata={"device": device}
+    )

@@ -1,0 +1,72 @@
+"""TRC: marker trajectories of Motion Analysis, OpenSim and others, as text between tabs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from ...recording.errors import MarchaError, UsageError
+from ..contract import CommonOptions, Import, ReportBuilder
+from ..leg import unique_markers
+from ..optical import float_rows, marker_import, read_text
+from ..units import conversion
+
+
+class TrcOptions(CommonOptions, frozen=True, kw_only=True):
+    """Nothing of its own."""
+
+
+class Trc:
+    """Importer ``trc``: ``/reference/markers``."""
+
+    name: ClassVar[str] = "trc"
+    title: ClassVar[str] = "TRC marker trajectories (Motion Analysis, OpenSim)"
+    Options = TrcOptions
+    beside: ClassVar[bool] = True
+
+    def sniff(self, head: bytes, path: Path) -> float:
+        """Its first word."""
+        return 1.0 if head.removeprefix(b"\xef\xbb\xbf").startswith(b"PathFileType") else 0.0
+
+    def read(self, paths: Sequence[Path], options: TrcOptions) -> Import:
+        """Read one file."""
+        path = paths[0]
+        lines = read_text(path).split("\n")
+        if len(lines) < 6 or not lines[0].startswith("PathFileType"):
+            raise MarchaError(
+                f"{path}, line 1: not the header of a TRC file (PathFileType, five lines, rows)"
+            )
+        facts = dict(zip(lines[1].split("\t"), (c.strip() for c in lines[2].split("\t")), strict=False))
+        try:
+            factor, _ = conversion(facts.get("Units", ""), "m")
+        except UsageError as error:
+            raise MarchaError(f"{path}, line 3: Units: {error}") from None
+        cells = lines[3].rstrip().split("\t")
+        if [c.strip() for c in cells[:2]] != ["Frame#", "Time"]:
+            raise MarchaError(f"{path}, line 4: begins with {cells[:2]}, not with Frame# and Time")
+        names = unique_markers([c.strip() for c in cells[2:] if c.strip()], path, 4)
+        if not names:
+            raise MarchaError(f"{path}, line 4: names no marker")
+        report = ReportBuilder()
+        stated = facts.get("NumMarkers", "")
+        if stated.isdigit() and int(stated) != len(names):
+            report.note("header_doubt", f"NumMarkers is {stated}, but {len(names)} markers are named", line=3)
+        columns = ["Frame#", "Time", *(f"{n} {a}" for n in names for a in "XYZ")]
+        values, rows = float_rows(path, lines[5:], 6, "\t", columns, report)
+        stated = facts.get("NumFrames", "")
+        if stated.isdigit() and int(stated) != len(values):
+            report.note("header_doubt", f"NumFrames is {stated}, but there are {len(values)} rows", line=3)
+        timeless = np.isnan(values[:, 1])
+        if timeless.any():
+            at = int(np.argmax(timeless))
+            report.drop(
+                "bad_row", "a row without a time; dropped", count=int(timeless.sum()), line=int(rows[at])
+            )
+            values, rows = values[~timeless], rows[~timeless]
+        t_ns = np.rint(values[:, 1] * 1e9).astype(np.int64)
+        pos = values[:, 2:].reshape(len(values), -1, 3) * factor
+        device = {"time": "column Time (s)", "rate_hz": facts.get("DataRate", "")}
+        return marker_import(t_ns, rows, names, pos, report, device)

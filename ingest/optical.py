@@ -1,0 +1,188 @@
+"""What the importers of optical captures share: rows of numbers as arrays, and arrays as blocks of channels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from ..recording.errors import MarchaError
+from .clock import Clock
+from .columns import MISSING
+from .contract import ChannelSpec, Import, ReportBuilder
+from .leg import MARKERS, MARKERS_TOPIC, unseen
+
+FloatArray = NDArray[np.float64]
+ROWS = 8192
+"""Rows of a block."""
+
+
+def read_text(path: Path) -> str:
+    """Return a text file, line ends as LF.
+
+    Raises
+    ------
+    MarchaError
+        It cannot be read.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return (
+        data.removeprefix(b"\xef\xbb\xbf")
+        .decode("utf-8", "replace")
+        .replace("\r\n", "\n")
+        .replace("\r", "\n")
+    )
+
+
+def float_rows(
+    path: Path,
+    lines: Sequence[str],
+    first_line: int,
+    separator: str,
+    names: Sequence[str],
+    report: ReportBuilder,
+) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Return rows of numbers (n, columns) and their lines; a missing cell is NaN.
+
+    Rows with more cells than ``names``, or without a number in the first column, are dropped (``bad_row``); a
+    cell that is no number becomes NaN (repair ``missing_cell``). Blank lines are nothing.
+
+    Raises
+    ------
+    MarchaError
+        No row is left.
+    """
+    width = len(names)
+    line = np.arange(first_line, first_line + len(lines), dtype=np.int64)
+    text = pl.Series(lines, dtype=pl.String).str.strip_chars_end(" ")
+    if separator == " ":
+        text = text.str.strip_chars().str.replace_all(r"[ \t]+", " ")
+    blank = (text.str.strip_chars(" \t,;") == "").to_numpy()
+    cells = (text.str.count_matches(separator, literal=True) + 1).to_numpy().astype(np.int64)
+    surplus = (cells > width).nonzero()[0]
+    for k in surplus[:1000].tolist():
+        if not text[k].split(separator, width)[-1].strip(f" {separator}"):
+            cells[k] = width  # trailing separators
+    bad = ~blank & (cells > width)
+    good = np.flatnonzero(~blank & ~bad)
+    values = np.empty((0, width))
+    if good.size:
+        # A first line as wide as the table, so that short rows are filled and long ones cut.
+        body = "\n".join([separator.join(["x"] * width), *text.gather(good).to_list()])
+        frame = pl.read_csv(
+            body.encode(),
+            separator=separator,
+            has_header=False,
+            infer_schema=False,
+            truncate_ragged_lines=True,
+            quote_char=None,
+        )[1:]
+        columns = []
+        for k, name in enumerate(names):
+            cell = frame[:, k].str.strip_chars()
+            value = cell.cast(pl.Float64, strict=False)
+            value = pl.select(pl.when(value.is_finite()).then(value)).to_series()
+            odd = cell.is_not_null() & value.is_null() & ~cell.str.to_lowercase().is_in(MISSING)
+            if k and odd.any():
+                at = int(odd.arg_true()[0])
+                report.repair(
+                    "missing_cell",
+                    f"{name}: {cell[at]!r} is not a number: taken as missing",
+                    count=int(odd.sum()),
+                    line=int(line[good[at]]),
+                    subject=f"{name} unreadable",
+                )
+            columns.append(value.fill_null(np.nan).to_numpy())
+        values = np.column_stack(columns)
+        without = np.isnan(values[:, 0])
+        bad[good[without]] = True
+        values, good = values[~without], good[~without]
+    if bad.any():
+        at = int(np.argmax(bad))
+        report.drop(
+            "bad_row",
+            f"{lines[at][:40]!r}: not {width} cells that begin with a number; row dropped",
+            count=int(bad.sum()),
+            line=int(line[at]),
+        )
+    if not good.size:
+        raise MarchaError(f"{path}: no row of numbers behind its header; nothing to convert")
+    return values, line[good]
+
+
+def blocks_of(
+    t_ns: NDArray[np.int64],
+    lines: NDArray[np.int64],
+    tables: Sequence[tuple[str, pl.DataFrame]],
+    report: ReportBuilder,
+) -> Iterator[tuple[str, pl.DataFrame]]:
+    """Yield tables of one clock block by block, times repaired and checked.
+
+    Parameters
+    ----------
+    t_ns, lines : ndarray
+        Time and line (or row) of every row.
+    tables : sequence of (str, polars.DataFrame)
+        Topic and its columns, as many rows.
+    report : ReportBuilder
+        Takes what is found.
+    """
+    wide = [table.rename({c: f"{k} {c}" for c in table.columns}) for k, (_, table) in enumerate(tables)]
+    frame = pl.DataFrame({"t": t_ns, "line": lines}).hstack([c for t in wide for c in t.get_columns()])
+    clock = Clock(report, tick_ns=1)
+    for block in clock.stream(frame[i : i + ROWS] for i in range(0, frame.height, ROWS)):
+        for k, (topic, table) in enumerate(tables):
+            yield topic, block.select("t_ns", *(pl.col(f"{k} {c}").alias(c) for c in table.columns))
+
+
+def marker_table(names: Sequence[str], pos: FloatArray) -> pl.DataFrame:
+    """Return markers (n, m, 3) in metres as the columns of :data:`MARKERS`."""
+    return pl.DataFrame(
+        {
+            f"{n}.{a}": np.ascontiguousarray(pos[:, k, j])
+            for k, n in enumerate(names)
+            for j, a in enumerate("xyz")
+        }
+    )
+
+
+def note_hidden(names: Sequence[str], pos: FloatArray, report: ReportBuilder) -> None:
+    """Say how much of the markers was not seen."""
+    hidden = np.isnan(pos).any(axis=2)
+    if hidden.any():
+        row, k = (int(i[0]) for i in np.nonzero(hidden))
+        report.note(
+            "missing_cell",
+            f"{MARKERS_TOPIC}: {100 * hidden.mean():.2g} % of the positions are missing (first {names[k]}): NaN",
+            count=int(hidden.sum()),
+            line=row + 1,
+            subject="hidden",
+        )
+
+
+def marker_import(
+    t_ns: NDArray[np.int64],
+    lines: NDArray[np.int64],
+    names: Sequence[str],
+    pos: FloatArray,
+    report: ReportBuilder,
+    device: dict[str, str],
+    more: Sequence[tuple[ChannelSpec, pl.DataFrame]] = (),
+) -> Import:
+    """Return the import of a capture of markers (m), and of channels ``more`` at the same times."""
+    note_hidden(names, pos, report)
+    table = marker_table(names, pos)
+    spec = ChannelSpec(MARKERS_TOPIC, MARKERS, "optical", tuple(table.columns))
+    tables = [(spec.topic, table), *((s.topic, t) for s, t in more)]
+    return Import(
+        channels=[spec, *(s for s, _ in more)],
+        blocks=unseen(blocks_of(t_ns, lines, tables, report), report),
+        report=report,
+        metadata={"device": {"clock": "device", "frames": "as the capture system has them", **device}},
+    )
