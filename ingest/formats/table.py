@@ -34,7 +34,11 @@ from ..mapping import (
 #: Share of the full scale at which a 16-bit converter says its last count.
 LAST_COUNT = 1 - 1.5 / 32768
 #: Messages whose columns go missing together: one finding a topic.
-TOGETHER = ("marcha_msgs/msg/OpticalMarkers", "geometry_msgs/msg/QuaternionStamped", "geometry_msgs/msg/PoseStamped")
+TOGETHER = (
+    "marcha_msgs/msg/OpticalMarkers",
+    "geometry_msgs/msg/QuaternionStamped",
+    "geometry_msgs/msg/PoseStamped",
+)
 
 
 class TableOptions(CommonOptions, frozen=True, kw_only=True):
