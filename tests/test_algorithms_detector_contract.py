@@ -37,5 +37,9 @@ class TestMag(DetectorContract):
     params: ClassVar[dict[str, Any]] = {"mag_max": 0.4, "window_s": 0.15}
 
 
+class TestGait(DetectorContract):
+    name = "gait"
+
+
 def test_none_is_left_out() -> None:
     assert {c.name for c in DetectorContract.__subclasses__()} == set(BY_NAME)

@@ -32,6 +32,22 @@ STEPS = record_type(
     ("was_still", "?"),
 )
 
+LONGEST_SWING_S = 5.0
+"""s: who moves for longer without a stance has lost them."""
+LONGEST_STRIDE_M = 4.0
+
+VERDICT = record_type(
+    ("fastest", "f8"),  # m/s
+    ("longest_stride", "f8"),  # m
+    ("n_long_strides", "i8"),
+    ("n_landings", "i8"),
+    ("navigated_s", "f8"),
+    ("lost_s", "f8"),  # time in swings beyond LONGEST_SWING_S
+    ("at_lowest", "i8", (6,)),  # samples at the lowest value of each column
+    ("at_highest", "i8", (6,)),
+)
+"""What says whether the results can be a walk."""
+
 CORE: Fields = [
     *NAVIGATION,
     ("started", "?"),
@@ -46,6 +62,7 @@ CORE: Fields = [
     ("lowest", "f8", (6,)),  # of acceleration and angular rate
     ("highest", "f8", (6,)),
     ("steps", STEPS),
+    ("verdict", VERDICT),
     ("rest", rest.REST),
     ("detector", DETECTOR),
 ]
@@ -111,8 +128,14 @@ def take(s: Any, ring: Any, row: FloatArray) -> bool:
 def _widen(s: Any, column: int, value: float, k: int) -> None:
     if k == 0 or value < s.lowest[column]:
         s.lowest[column] = value
+        s.verdict.at_lowest[column] = 0
     if k == 0 or value > s.highest[column]:
         s.highest[column] = value
+        s.verdict.at_highest[column] = 0
+    if value == s.lowest[column]:
+        s.verdict.at_lowest[column] += 1
+    if value == s.highest[column]:
+        s.verdict.at_highest[column] += 1
 
 
 @compiled
@@ -165,18 +188,36 @@ def emit(s: Any, r: Any, out: FloatArray) -> None:
         out[VELOCITY + i] = s.vel[i]
     out[POSE + 3], out[POSE + 4], out[POSE + 5], out[POSE + 6] = quat_of(s.rot)
     s.steps.swing += r.dt
+    _note_verdict(s, r)
     if r.still:
         s.n_still += 1
         if not s.steps.was_still:
-            _land(s.steps, s.pos, out)
+            _land(s.steps, s.verdict, s.pos, out)
         s.steps.swing = 0.0
     s.steps.was_still = r.still
 
 
+@inlined
+def _note_verdict(s: Any, r: Any) -> None:
+    """Note what the sample ``r`` says of the plausibility of the run."""
+    v = s.verdict
+    v.navigated_s += r.dt
+    speed = s.vel[0] * s.vel[0] + s.vel[1] * s.vel[1] + s.vel[2] * s.vel[2]
+    if speed > v.fastest * v.fastest:
+        v.fastest = math.sqrt(speed)
+    if s.steps.swing > LONGEST_SWING_S:
+        v.lost_s += r.dt
+
+
 @compiled
-def _land(steps: Any, pos: Any, out: FloatArray) -> None:
+def _land(steps: Any, verdict: Any, pos: Any, out: FloatArray) -> None:
     """At the first still sample after a swing: write the step from the previous landing, if long enough."""
     x, y, z = pos[0] - steps.landing[0], pos[1] - steps.landing[1], pos[2] - steps.landing[2]
+    verdict.n_landings += 1
+    length = math.sqrt(x * x + y * y + z * z)
+    verdict.longest_stride = max(verdict.longest_stride, length)
+    if length > LONGEST_STRIDE_M:
+        verdict.n_long_strides += 1
     if steps.swing < steps.min_s or math.sqrt(x * x + y * y + z * z) < steps.min_m:
         return
     out[STEP] = steps.swing

@@ -20,6 +20,16 @@ IMU = Input(
 SOURCE_RATE_HZ = 100.0
 """Sample rate of the source's device, for a bare ``make()``; a different measured rate is remarked."""
 
+PUBLISHED: dict[str, Any] = {
+    "detector": "c1c2c3",
+    "init": "fixed",
+    "rest_acc": 0.8,
+    "rest_gyr": 0.3,
+}
+"""The source's detector and its rest of a fixed length."""
+ADAPTIVE: dict[str, Any] = {"detector": "gait", "init": "adaptive", "rest_acc": 0.5, "rest_gyr": 0.15}
+"""A start for every walk and stances in every gait, without a threshold to set."""
+
 POSE = Output(
     "pose",
     "geometry_msgs/msg/PoseStamped",
@@ -62,8 +72,10 @@ class FootEstimator(RowKernel):
     has_sigma: ClassVar[bool] = True
     extra_inputs: ClassVar[tuple[Input, ...]] = ()
     presets: ClassVar[dict[str, dict[str, Any]]] = {
-        "short-rest": {"init_s": 0.3},
-        "live": {"window_side": "trailing", "cleaning": "median"},
+        "adaptive": ADAPTIVE,
+        "published": PUBLISHED,
+        "short-rest": PUBLISHED | {"init_s": 0.3},
+        "live": PUBLISHED | {"window_side": "trailing", "cleaning": "median"},
         "shoe-tuned": {"detector": "shoe", "shoe_max": 1e5},
         "are-tuned": {"detector": "are", "are_max": 0.3},
         "mv-tuned": {"detector": "mv", "mv_max": 0.3, "window_s": 0.15},
@@ -84,6 +96,9 @@ class FootEstimator(RowKernel):
         rest, steps = record.rest, record.steps
         rest.length, rest.acc_max, rest.gyr_max = p.init_s, p.rest_acc, p.rest_gyr
         rest.bias_max, rest.gravity, rest.gravity_from_rest = p.rest_bias_max, p.gravity, p.gravity_from_rest
+        rest.adaptive, rest.shortest = p.init == "adaptive", min(p.init_min_s, p.init_s)
+        rest.takes_bias = p.rest_bias
+        rest.quietest = np.inf
         rest.index = -1
         steps.min_s, steps.min_m = p.step_min_s, p.step_min_m
         record.trapezoid = p.integration == "trapezoid"
@@ -148,4 +163,4 @@ class FootEstimator(RowKernel):
 
     def remarks(self) -> list[Remark]:
         """Return what the data did that the results' user must know."""
-        return remarks(self.record, self.params, self.rate_hz)
+        return remarks(self.record, self.params, self.rate_hz, self.has_sigma)

@@ -28,13 +28,13 @@ class FootParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         ),
     ] = 0.0
     detector: Annotated[
-        Literal["c1c2c3", "pitch", "shoe", "are", "mv", "mag"],
+        Literal["gait", "c1c2c3", "pitch", "shoe", "are", "mv", "mag"],
         meta("Which detector decides that the foot is still", source=DISSERTATION),
     ] = "c1c2c3"
     window_s: Annotated[
         float,
         meta(
-            "Length of the statistic's window; 0: the detector's own (c1c2c3 0.1, pitch 0.2, others 0.05)",
+            "Length of the statistic's window; 0: the detector's own (c1c2c3 0.1, pitch 0.2, gait 0.025, others 0.05)",
             "s",
             f"{DISSERTATION}: n = 5…10 and 20 samples at 100 Hz; Skog et al. 2010: 5 samples",
             ge=0.0,
@@ -46,20 +46,31 @@ class FootParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         meta("Window and median around the sample (adds latency) or behind it (none)", source=DISSERTATION),
     ] = "centred"
     cleaning: Annotated[
-        Literal["median", "fill-burst", "none"],
+        Literal["own", "median", "fill-burst", "none"],
         meta(
-            "Cleaning of the raw decisions: majority, or fill short gaps and then drop short bursts",
+            "Cleaning of the raw decisions: majority, or fill short gaps and then drop short bursts; own: the "
+            "detector's (gait none, others median)",
             source=DISSERTATION,
         ),
-    ] = "median"
+    ] = "own"
     cleaning_s: Annotated[
         float,
         meta("Length of the cleaning window", "s", f"{DISSERTATION}: 10 samples at 100 Hz", gt=0.0, le=10.0),
     ] = 0.1
+    init: Annotated[
+        Literal["adaptive", "fixed"],
+        meta(
+            "Rest at the start: as long as there is one, between init_min_s and init_s, or exactly init_s",
+            source="fixed: dissertation, section 3.6; adaptive: ours",
+        ),
+    ] = "fixed"
+    init_min_s: Annotated[
+        float, meta("adaptive: shortest rest from which it starts", "s", "ours", gt=0.0, le=600.0)
+    ] = 0.1
     init_s: Annotated[
         float,
         meta(
-            "Length of the rest from which it starts",
+            "Length of the rest from which it starts; adaptive: the longest that is waited for",
             "s",
             "dissertation, section 3.6: 200 samples",
             gt=0.0,
@@ -83,6 +94,13 @@ class FootParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             gt=0.0,
         ),
     ] = 0.6
+    rest_bias: Annotated[
+        bool,
+        meta(
+            "Take the gyroscope's bias from the rest; false leaves it in, as a program without that step does",
+            source="dissertation, section 3.6",
+        ),
+    ] = True
     gravity: Annotated[float, meta("Local gravity", "m/s²", "dissertation", gt=0.0, le=30.0)] = 9.81
     gravity_from_rest: Annotated[
         bool,

@@ -14,7 +14,7 @@ RESTLESS = 0.03
 """rad/s: above this spread of the rate the rest at the start is remarked."""
 
 
-def remarks(s: Any, p: Any, rate_hz: float) -> list[Remark]:
+def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[Remark]:
     """Return the remarks of a run whose state's record is ``s``, by its parameters ``p``."""
     taken, elapsed = int(s.taken), s.time
     if taken == 0:
@@ -26,7 +26,7 @@ def remarks(s: Any, p: Any, rate_hz: float) -> list[Remark]:
             Remark(
                 "not_finite",
                 f"{s.repaired} of {taken} rows held a value that is not finite; the previous one was kept",
-                fatal=share > 0.01,
+                fatal=bool(share > 0.01),
             )
         )
     for i, column in enumerate(IMU_COLUMNS):
@@ -63,18 +63,39 @@ def remarks(s: Any, p: Any, rate_hz: float) -> list[Remark]:
         )
         return found
     start = s.rest.begin
-    if start > 0.5:
+    moved = s.rest.moved + s.rest.moved_before
+    if s.rest.moved_before > rate_hz and s.rest.moved_before > 0.5 * moved:
+        found.append(
+            Remark(
+                "late_start",
+                f"the first rest begins at {start:.2f} s, after {100 * s.rest.moved_before / moved:.0f} % of "
+                "the motion: what is estimated is not the walk; stand still at the start, or use "
+                "init=adaptive, which starts in the first stance",
+                fatal=True,
+            )
+        )
+    elif start > 0.5:
+        wanted = f"{p.init_s:g} s" if p.init == "fixed" else f"{min(p.init_min_s, p.init_s):g} s"
         found.append(
             Remark(
                 "no_rest",
-                f"no rest of {p.init_s:g} s at the start; the first one begins at {start:.2f} s, and the "
+                f"no rest of {wanted} at the start; the first one begins at {start:.2f} s, and the "
                 f"estimate starts "
-                f"at its end, after {100 * (s.rest.index + 1) / taken:.0f} % of the rows; a shorter "
-                f"init_s may find one "
-                "earlier",
+                f"at its end, after {100 * (s.rest.index + 1) / taken:.0f} % of the rows"
+                + ("; a shorter init_s may find one earlier" if p.init == "fixed" else ""),
             )
         )
     spread = math.sqrt(s.rest.spread / s.rest.count)
+    if s.rest.adaptive and s.rest.quietest < math.inf:
+        spread = math.sqrt(max(0.0, s.rest.quietest))
+    elif s.rest.adaptive:
+        found.append(
+            Remark(
+                "short_rest",
+                f"the rest at {start:.2f} s lasts {s.rest.elapsed:.2f} s: too short to tell the gyroscope's "
+                "bias from a turning foot; the heading may drift",
+            )
+        )
     if spread > RESTLESS:
         found.append(
             Remark(
@@ -141,7 +162,68 @@ def remarks(s: Any, p: Any, rate_hz: float) -> list[Remark]:
         found.append(
             Remark("no_step", "the sensor moved, but no step was found: wrong detector or wrong mounting?")
         )
+    found += verdict(s, p) if is_corrected else []
     position = s.pos
     if s.started and not (np.all(np.isfinite(position)) and np.all(np.abs(position) < 1e6)):
         found.append(Remark("diverged", f"the position ran away to {position} m", fatal=True))
+    return found
+
+
+FASTEST = 15.0
+"""m/s: no foot swings faster, sprinters' apart."""
+CLIPPED_SAMPLES = 5
+LEAST_CEILING = (15.0, 15.0, 15.0, 3.0, 3.0, 3.0)
+"""m/s², rad/s: the same extreme value many times is a ceiling only beyond what a rest reaches."""
+
+
+def verdict(s: Any, p: Any) -> list[Remark]:
+    """Return what speaks against the results being a walk."""
+    v, found = s.verdict, []
+    if v.fastest > FASTEST:
+        found.append(
+            Remark(
+                "implausible_speed",
+                f"the foot reaches {v.fastest:.1f} m/s (a runner's: up to {FASTEST:g}): stances were missed; try "
+                "detector=gait",
+                fatal=True,
+            )
+        )
+    if v.n_long_strides:
+        share = v.n_long_strides / max(1, v.n_landings)
+        found.append(
+            Remark(
+                "implausible_stride",
+                f"{v.n_long_strides} of {v.n_landings} strides are longer than 4 m (longest "
+                f"{v.longest_stride:.1f} m): stances were missed; try detector=gait",
+                fatal=bool(share > 0.1),
+            )
+        )
+    if v.lost_s > 0.0:
+        share = v.lost_s / v.navigated_s
+        found.append(
+            Remark(
+                "lost_stances",
+                f"for {v.lost_s:.1f} s ({100 * share:.0f} % of the time) no stance was found within 5 s: the "
+                "position drifts there",
+                fatal=bool(share > 0.2),
+            )
+        )
+    if v.n_landings >= 20 and v.n_landings > 3 * s.steps.count:
+        found.append(
+            Remark(
+                "not_gait",
+                f"{v.n_landings} stances make only {s.steps.count} steps: this is no walk, or the detector "
+                f"{p.detector} breaks its stances; the position between them is doubtful",
+            )
+        )
+    for i, column in enumerate(IMU_COLUMNS):
+        for value, count in ((s.lowest[i], v.at_lowest[i]), (s.highest[i], v.at_highest[i])):
+            if count >= CLIPPED_SAMPLES and abs(value) > LEAST_CEILING[i]:
+                found.append(
+                    Remark(
+                        "clipped",
+                        f"{column} stands at its extreme {value:.4g} in {count} rows: the sensor's range is too "
+                        "small for this walk, turns and speeds in the swing are underestimated",
+                    )
+                )
     return found

@@ -1,8 +1,13 @@
 """The rest from which a foot estimator starts.
 
 Dissertation, section 3.6: gyroscope bias and level from the mean of a rest. It is verified, not assumed: it
-is the first stretch of ``init_s`` in which every sample stays within ``rest_acc`` and ``rest_gyr`` of the
-running mean, and whose mean rate is small enough to be a bias.
+is a stretch in which every sample stays within ``rest_acc`` and ``rest_gyr`` of the running mean, and whose
+mean rate is small enough to be a bias.
+
+``fixed`` (the source): the first such stretch that lasts ``init_s``. ``adaptive`` (ours): the first that lasts
+``init_min_s``, taken to its end or to ``init_s``; a walk that begins in motion so starts in its first stance.
+The bias is then the mean rate of the quietest half second of it, for a foot that is about to walk turns before
+it moves: taken for a bias, that turns the whole walk.
 """
 
 from __future__ import annotations
@@ -17,13 +22,27 @@ from ..numerics.strapdown import level
 LONGEST_PAUSE_S = 0.5
 """A longer time step interrupts a rest: nothing is known about what happened in it."""
 
+PIECE_S = 0.125
+PIECES = 4
+"""The quietest stretch of a rest is found in steps of such pieces (s), so many at a time."""
+
+PIECE = record_type(
+    ("elapsed", "f8"),
+    ("count", "i8"),
+    ("total", "f8", (3,)),  # sum of ω
+    ("squares", "f8"),  # sum of ‖ω‖²
+)
+
 REST = record_type(
-    ("length", "f8"),  # wanted, s
+    ("length", "f8"),  # wanted, s; of an adaptive rest the longest
+    ("adaptive", "?"),
+    ("shortest", "f8"),  # of an adaptive rest, s
     ("acc_max", "f8"),
     ("gyr_max", "f8"),
     ("bias_max", "f8"),
     ("gravity", "f8"),  # the parameter
     ("gravity_from_rest", "?"),
+    ("takes_bias", "?"),  # else the gyroscope's bias stays in its readings
     ("count", "i8"),
     ("begin", "f8"),  # s since the first row
     ("elapsed", "f8"),  # s
@@ -33,6 +52,12 @@ REST = record_type(
     ("longest", "f8"),  # longest rest seen, s
     ("index", "i8"),  # sample that completed the rest, −1 not yet
     ("moved", "i8"),  # samples after the rest that are not at rest
+    ("moved_before", "i8"),  # samples before it that are not
+    ("pieces", PIECE, (PIECES,)),  # the newest pieces of the rest, a ring
+    ("n_pieces", "i8"),  # whole ones so far
+    ("quietest", "f8"),  # variance of the rate in the quietest stretch, rad²/s²; infinite without one
+    ("bias", "f8", (3,)),  # mean rate there
+    ("bias_count", "i8"),  # its samples
 )
 
 
@@ -49,6 +74,63 @@ def _is_near(rest: Any, r: Any) -> bool:
 
 
 @inlined
+def _is_bias(rest: Any) -> bool:
+    """Return whether the mean rate is small enough to be a bias."""
+    x, y, z = rest.gyr[0], rest.gyr[1], rest.gyr[2]
+    return math.sqrt(x * x + y * y + z * z) <= rest.bias_max
+
+
+@compiled
+def _clear(piece: Any) -> None:
+    piece.elapsed = 0.0
+    piece.count = 0
+    piece.squares = 0.0
+    for i in range(3):
+        piece.total[i] = 0.0
+
+
+@compiled
+def _note(rest: Any, r: Any) -> None:
+    """Take a sample of the rest into its present piece; keep the quietest stretch."""
+    now = rest.pieces[rest.n_pieces % PIECES]
+    now.elapsed += r.dt
+    now.count += 1
+    now.squares += r.gyr_norm * r.gyr_norm
+    for i in range(3):
+        now.total[i] += r.gyr[i]
+    if now.elapsed < PIECE_S:
+        return
+    rest.n_pieces += 1
+    if rest.n_pieces >= PIECES:
+        _compare(rest)
+    _clear(rest.pieces[rest.n_pieces % PIECES])
+
+
+@compiled
+def _compare(rest: Any) -> None:
+    """Keep mean and variance of the newest pieces where they are the quietest so far."""
+    n = 0
+    for k in range(PIECES):
+        n += rest.pieces[k].count
+    variance = 0.0
+    for k in range(PIECES):
+        variance += rest.pieces[k].squares / n
+    for i in range(3):
+        mean = 0.0
+        for k in range(PIECES):
+            mean += rest.pieces[k].total[i] / n
+        variance -= mean * mean
+    if variance >= rest.quietest:
+        return
+    rest.quietest = variance
+    rest.bias_count = n
+    for i in range(3):
+        rest.bias[i] = 0.0
+        for k in range(PIECES):
+            rest.bias[i] += rest.pieces[k].total[i] / n
+
+
+@inlined
 def watch(rest: Any, r: Any, k: int, time: float) -> bool:
     """Take sample ``k`` at ``time`` into the search for a rest; return True where it completes it."""
     if rest.index >= 0:
@@ -57,11 +139,24 @@ def watch(rest: Any, r: Any, k: int, time: float) -> bool:
         return False
     dt = r.dt
     if rest.count > 0 and (dt > LONGEST_PAUSE_S or not _is_near(rest, r)):
+        if (
+            rest.adaptive
+            and rest.elapsed + 5e-10 >= rest.shortest
+            and dt <= LONGEST_PAUSE_S
+            and _is_bias(rest)
+        ):
+            rest.index = k
+            return True
+        rest.moved_before += rest.count
         rest.count = 0
     if rest.count == 0:
         rest.begin = time
         rest.elapsed = 0.0
         rest.spread = 0.0
+        if rest.adaptive:
+            rest.quietest = math.inf
+            rest.n_pieces = 0
+            _clear(rest.pieces[0])
         for i in range(3):
             rest.acc[i] = 0.0
             rest.gyr[i] = 0.0
@@ -73,12 +168,14 @@ def watch(rest: Any, r: Any, k: int, time: float) -> bool:
         rest.gyr[i] += (r.gyr[i] - rest.gyr[i]) / rest.count
     spread = _distance(r.gyr, rest.gyr)
     rest.spread += spread * spread
+    if rest.adaptive:
+        _note(rest, r)
     rest.longest = max(rest.longest, rest.elapsed)
     # Half a nanosecond of grace: time steps are rounded differences.
     if rest.elapsed + 5e-10 < rest.length:
         return False
-    x, y, z = rest.gyr[0], rest.gyr[1], rest.gyr[2]
-    if math.sqrt(x * x + y * y + z * z) > rest.bias_max:
+    if not _is_bias(rest):
+        rest.moved_before += rest.count
         rest.count = 0  # a steady turn, not a rest
         return False
     rest.index = k
@@ -92,3 +189,9 @@ def start(s: Any) -> None:
     x, y, z = rest.acc[0], rest.acc[1], rest.acc[2]
     gravity = math.sqrt(x * x + y * y + z * z) if rest.gravity_from_rest else rest.gravity
     level(s, rest.acc, rest.gyr, gravity)
+    if rest.adaptive and rest.quietest < math.inf:
+        for i in range(3):
+            s.bias_gyr[i] = rest.bias[i]
+    if not rest.takes_bias:
+        for i in range(3):
+            s.bias_gyr[i] = 0.0

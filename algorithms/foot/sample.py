@@ -13,6 +13,7 @@ SAMPLE = record_type(
     ("gyr_norm", "f8"),
     ("pitch", "f8"),  # deg, where the detector follows it
     ("statistic", "f8", (3,)),  # of the detector, as many as it has
+    ("queue", "i8"),  # place in the queue of an adaptive detector
     ("raw", "?"),  # the detector's decision about this sample alone
     ("filled", "?"),  # after short gaps were closed
     ("still", "?"),  # the decision

@@ -3,9 +3,9 @@
 Every detector turns a window of samples into one to three statistics and a raw decision, and the decisions
 are then cleaned (:mod:`.cleaning`). Windows are ``centred`` on the sample that they speak of or ``trailing``
 (only its past); at both ends of the data they are cut off. What a detector must look ahead is its latency:
-half a centred window plus the look-ahead of the cleaning. The estimator holds its samples back by as much, so
-the decision about sample k meets sample k. Every length is in seconds and becomes ``round(length · rate)``
-samples.
+half a centred window, the horizon of an adaptive detector, and the look-ahead of the cleaning. The estimator
+holds its samples back by as much, so the decision about sample k meets sample k. Every length is in seconds
+and becomes ``round(length · rate)`` samples.
 
 ==========  ==================================================  =============================================
 detector    statistics (columns of the output ``detector``)     still where
@@ -17,6 +17,8 @@ detector    statistics (columns of the output ``detector``)     still where
 ``are``     ``are``: mean ‖ω‖², rad²/s²                         below are_max
 ``mv``      ``mv``: mean ‖f − f̄‖², m²/s⁴                        below mv_max
 ``mag``     ``mag``: mean (‖f‖ − g)², m²/s⁴                     below mag_max
+``gait``    ``shoe``, ``threshold``: gait_ratio times the       shoe below threshold
+            least shoe within gait_horizon_s
 ==========  ==================================================  =============================================
 
 Sources: c1c2c3 and pitch from the foot-navigation dissertation (sections 4.4 and 4.4.1; after Jiménez et al.
@@ -34,7 +36,7 @@ from typing import Any
 
 from ...numerics.compiled import inlined
 from ...numerics.records import record_type
-from . import are, c1c2c3, mag, mv, pitch, shoe
+from . import are, c1c2c3, gait, mag, mv, pitch, shoe
 from .cleaning import CLEANING, CLEANINGS, clean
 from .contract import Detector
 
@@ -47,16 +49,20 @@ DETECTORS: tuple[type[Detector], ...] = (
     are.Are,
     mv.Mv,
     mag.Mag,
+    gait.Gait,
 )
 NAMES = tuple(d.name for d in DETECTORS)
 BY_NAME = dict(zip(NAMES, DETECTORS, strict=True))
-C1C2C3, PITCH, SHOE, ARE, MV, MAG = (NAMES.index(n) for n in ("c1c2c3", "pitch", "shoe", "are", "mv", "mag"))
+C1C2C3, PITCH, SHOE, ARE, MV, MAG, GAIT = (
+    NAMES.index(n) for n in ("c1c2c3", "pitch", "shoe", "are", "mv", "mag", "gait")
+)
 
 DETECTOR = record_type(
     ("kind", "i8"),  # index into DETECTORS
     ("before", "i8"),  # samples of the statistic's window before the sample that it speaks of
     ("after", "i8"),  # samples after it
-    ("latency", "i8"),  # look-ahead of window and cleaning, samples
+    ("horizon", "i8"),  # look-ahead of the decision beyond the window, samples
+    ("latency", "i8"),  # look-ahead of window, horizon and cleaning, samples
     ("cleaning", record_type(*CLEANING)),
     *((d.name, d.RECORD) for d in DETECTORS),
 )
@@ -78,8 +84,10 @@ def judge(d: Any, ring: Any, j: int, last: int) -> None:
         still = are.judge(d.are, ring, j, lo, hi)
     elif kind == MV:
         still = mv.judge(d.mv, ring, j, lo, hi)
-    else:
+    elif kind == MAG:
         still = mag.judge(d.mag, ring, j, lo, hi)
+    else:
+        still = gait.judge(d.gait, ring, j, lo, hi)
     ring[j & (ring.shape[0] - 1)].raw = still
 
 
@@ -93,6 +101,10 @@ def decide(d: Any, ring: Any, k: int, last: int) -> None:
     j = k - d.after
     if 0 <= j <= last:
         judge(d, ring, j, last)
+    if d.horizon > 0:
+        j -= d.horizon
+        if 0 <= j <= last:
+            ring[j & (ring.shape[0] - 1)].raw = gait.settle(d.gait, ring, j)
     clean(d.cleaning, ring, j, last)
 
 
@@ -112,19 +124,23 @@ def configure(record: Any, params: Any, rate_hz: float) -> int:
     """
     chosen = BY_NAME[params.detector]
     window = _samples(params.window_s or chosen.window_s, rate_hz)
-    length = _samples(params.cleaning_s, rate_hz) if params.cleaning != "none" else 1
+    kind = chosen.cleaning if params.cleaning == "own" else params.cleaning
+    length = _samples(params.cleaning_s, rate_hz) if kind != "none" else 1
     record.kind = NAMES.index(params.detector)
     record.before, record.after = _split(window, params.window_side)
     cleaning = record.cleaning
-    cleaning.kind, cleaning.length = CLEANINGS.index(params.cleaning), length
+    cleaning.kind, cleaning.length = CLEANINGS.index(kind), length
     cleaning.before, cleaning.after = _split(length, params.window_side)
-    if params.cleaning == "fill-burst":
+    if kind == "fill-burst":
         cleaning.before, cleaning.after = 0, 2 * (length - 1)
     cleaning.last_raw = -1
-    record.latency = record.after + cleaning.after
+    horizon_s = chosen.horizon_s(params)
+    record.horizon = _samples(horizon_s, rate_hz) if horizon_s else 0
+    record.gait.horizon = record.horizon
+    record.latency = record.after + record.horizon + cleaning.after
     for detector in DETECTORS:
         detector.configure(getattr(record, detector.name), params)
-    return int(record.latency + record.before + cleaning.before)
+    return int(record.latency + record.before + record.horizon + cleaning.before)
 
 
 def _samples(seconds: float, rate_hz: float) -> int:

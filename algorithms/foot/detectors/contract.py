@@ -32,6 +32,8 @@ class Detector:
         Names of the statistics, at most three.
     window_s : float
         Length of the window where ``window_s`` is not given, s.
+    cleaning : str
+        Cleaning of the raw decisions where the parameter ``cleaning`` says ``own``.
     """
 
     name: ClassVar[str]
@@ -41,6 +43,12 @@ class Detector:
     RECORD: ClassVar[np.dtype[Any]]
     statistics: ClassVar[tuple[str, ...]]
     window_s: ClassVar[float] = 0.05
+    cleaning: ClassVar[str] = "median"
+
+    @classmethod
+    def horizon_s(cls, params: Any) -> float:
+        """Return how far beyond its window the decision looks ahead, s; its module then has ``settle``."""
+        return 0.0
 
     @classmethod
     def configure(cls, record: Any, params: Any) -> None:
