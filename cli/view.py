@@ -17,6 +17,8 @@ def view(
     web: bool = False,
     rrd: Annotated[Path | None, Parameter(name="--rrd")] = None,
     online: bool = False,
+    figure: Path | None = None,
+    kind: str = "walk",
     force: Force = False,
     common: Common = DEFAULT,
 ) -> Outcome:
@@ -32,8 +34,12 @@ def view(
         Write a Rerun file instead of opening a viewer.
     online : bool
         Let the viewer reach other hosts: tiles of maps, and Rerun's own reports of its use.
+    figure : Path
+        Write a figure (.png or .svg) instead of opening a viewer.
+    kind : str
+        Which figure: walk, signals, steps, heading, fixes, floor, radio, error, joints, jumps.
     force : bool
-        Replace an existing Rerun file.
+        Replace an existing file.
     """
     from .. import recording, viz
     from ..recording.errors import UsageError
@@ -42,8 +48,12 @@ def view(
         raise UsageError("view: name at least one recording")
     if web and rrd is not None:
         raise UsageError("view: --web opens a viewer and --rrd writes a file; give one of them")
+    if figure is not None and (web or rrd is not None):
+        raise UsageError("view: --figure writes a figure; give it without --web and --rrd")
     recs = [recording.open(path) for path in paths]
-    if rrd is not None:
+    if figure is not None:
+        viz.save_figure(recs, figure, kind=kind, overwrite=force)
+    elif rrd is not None:
         viz.write_rrd(recs, rrd, overwrite=force)
     else:
         viz.show(
@@ -54,4 +64,6 @@ def view(
         )
     say_losses(*recs)
     document = {"paths": [str(p) for p in paths], "rrd": str(rrd) if rrd else None, "web": web}
-    return Outcome(document, [Heading(f"wrote {rrd}")] if rrd else [])
+    document["figure"] = str(figure) if figure else None
+    wrote = figure or rrd
+    return Outcome(document, [Heading(f"wrote {wrote}")] if wrote else [])

@@ -19,6 +19,7 @@ from ..recording.atomic import AtomicFile
 from ..recording.errors import UsageError
 from ..replay.metrics import Comparison
 from . import style
+from .text import printable
 from .trace import Trace, compared, distance, framed, reference_of
 
 if TYPE_CHECKING:
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 ALIGNMENT = "origin-yaw"
+WALK = "walk"
+"""The figure of tracks, heights, stances and errors."""
+
 POINTS = 20_000
 """Most points of a line: more than any printer resolves."""
 
@@ -36,7 +40,15 @@ POSE = "geometry_msgs/msg/PoseStamped"
 POSITION_SIGMA = ("sigma_pos_x", "sigma_pos_y", "sigma_pos_z")
 
 
-def figure(recs: Recording | Sequence[Recording], *, alignment: str = ALIGNMENT) -> Figure:
+def available_figures() -> dict[str, str]:
+    """Return the figures by name, with one line each."""
+    from .domain_figures import FIGURES
+
+    lines = {name: (draw.__doc__ or "").strip().splitlines()[0] for name, draw in FIGURES.items()}
+    return {WALK: "Tracks, height, stances under the accelerometer's norm, errors.", **lines}
+
+
+def figure(recs: Recording | Sequence[Recording], *, kind: str = WALK, alignment: str = ALIGNMENT) -> Figure:
     """Return the figure of a recording: tracks, height, stances under the accelerometer's norm, errors.
 
     Parameters
@@ -44,6 +56,8 @@ def figure(recs: Recording | Sequence[Recording], *, alignment: str = ALIGNMENT)
     recs : Recording or sequence of Recording
         With estimates, or raw (then only the signals are drawn). Several get one row each: tracks, height,
         errors.
+    kind : str
+        Another figure by its name, of one recording; see :func:`available_figures`.
     alignment : str
         How tracks are laid upon the reference; see :func:`marcha.replay.alignment.align`.
 
@@ -51,10 +65,29 @@ def figure(recs: Recording | Sequence[Recording], *, alignment: str = ALIGNMENT)
     -------
     matplotlib.figure.Figure
         With the Agg canvas; save it with :func:`save_figure` for reproducible bytes.
+
+    Raises
+    ------
+    UsageError
+        No figure of this name, several recordings for one of another kind than ``walk``, or nothing in the
+        recording for it.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    if kind != WALK:
+        from .domain_figures import FIGURES
+
+        chosen = [recs] if isinstance(recs, Recording) else list(recs)
+        if kind not in FIGURES:
+            raise UsageError(f"figure {kind!r} is unknown; there are {', '.join(available_figures())}")
+        if len(chosen) != 1:
+            raise UsageError(f"figure {kind!r} is of one recording, not of {len(chosen)}")
+        own = Figure(dpi=120, layout="constrained", facecolor="white")
+        FigureCanvasAgg(own)
+        FIGURES[kind](chosen[0], own)
+        own.suptitle(printable(chosen[0].path.stem), fontsize=12, fontweight="bold")
+        return own
     walks = [_walk(rec, alignment) for rec in ([recs] if isinstance(recs, Recording) else recs)]
     if len(walks) == 1:
         size = (12.0, 7.0 if walks[0].tracks else 4.0)
@@ -85,6 +118,7 @@ def save_figure(
     path: Path | str,
     *,
     overwrite: bool = False,
+    kind: str = WALK,
     alignment: str = ALIGNMENT,
 ) -> Path:
     """Write the figure of one or several recordings as PNG or SVG, by the suffix.
@@ -104,15 +138,15 @@ def save_figure(
     import matplotlib
 
     path = Path(path)
-    kind = path.suffix.lower().lstrip(".")
-    if kind not in ("png", "svg"):
+    suffix = path.suffix.lower().lstrip(".")
+    if suffix not in ("png", "svg"):
         raise UsageError(f"{path}: figures are .png or .svg, not {path.suffix or 'without suffix'}")
     file = AtomicFile(path, overwrite=overwrite)
     try:
         # neither dates nor versions nor random ids: the same recording gives the same bytes
-        metadata = {"Software": None} if kind == "png" else {"Date": None, "Creator": None}
+        metadata = {"Software": None} if suffix == "png" else {"Date": None, "Creator": None}
         with matplotlib.rc_context({"svg.hashsalt": "marcha", "svg.fonttype": "path"}):
-            figure(recs, alignment=alignment).savefig(file.part, format=kind, metadata=metadata)
+            figure(recs, kind=kind, alignment=alignment).savefig(file.part, format=suffix, metadata=metadata)
     except BaseException:
         file.abort()
         raise

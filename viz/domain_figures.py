@@ -1,0 +1,349 @@
+"""Figures of phones, of radio indoors and of joints, by name; :func:`marcha.viz.save_figure` writes them.
+
+Each takes a recording and an empty figure, and raises UsageError where the recording has nothing for it.
+Channels are found by message type and columns, never by the name of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from ..recording import Recording
+from ..recording.errors import UsageError
+from . import style
+from .canvas import PLACES, is_estimate
+from .curve import Curve
+from .floor import Anchor, floor_plan, loaders_of
+from .shapes import ELLIPSE95, circle, geo_circle, metres_a_degree
+from .text import printable
+from .trace import Trace, compared, distance, reference_of
+from .views.base import role_of
+from .views.joint import difference
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+GRID = {"color": "#DDDDDD", "linewidth": 0.6}
+JOINT, NAMED = "sensor_msgs/msg/JointState", "marcha_msgs/msg/NamedValues"
+MOST_ELLIPSES = 25
+TIME = "time since the start (s)"
+
+
+def _topics(rec: Recording, needs: Sequence[str], *schemas: str, role: str = "") -> list[str]:
+    """Return the topics with these columns, of these message types, in this role."""
+    return [
+        t
+        for t, c in rec.channels.items()
+        if set(needs) <= set(c.columns)
+        and (not schemas or c.schema in schemas)
+        and (not role or role_of(t) == role)
+        and c.count
+    ]
+
+
+def _found(rec: Recording, what: str, topics: list[str]) -> list[str]:
+    if not topics:
+        raise UsageError(f"{rec.path}: nothing for this figure: no {what}")
+    return topics
+
+
+def _s(rec: Recording, table: pl.DataFrame) -> Floats:
+    """Return times since the start of the recording, s."""
+    return (table["t_ns"].to_numpy() - (rec.start_ns or 0)) / 1e9
+
+
+def _owner(topic: str) -> str:
+    return printable(topic.split("/")[2] if is_estimate(topic) else topic)
+
+
+def _color(rec: Recording, topic: str) -> str:
+    runs = list(dict.fromkeys(t.split("/")[2] for t in rec.channels if is_estimate(t)))
+    if is_estimate(topic):
+        return style.run_color(runs.index(topic.split("/")[2]))
+    return style.REFERENCE if role_of(topic) == "reference" else style.DEVICE
+
+
+def _dress(ax: Axes, title: str, x: str, y: str, *, legend: bool = True) -> None:
+    ax.set_title(title, fontsize=10, loc="left")
+    ax.set_xlabel(x, fontsize=9)
+    ax.set_ylabel(y, fontsize=9)
+    ax.tick_params(labelsize=8)
+    ax.grid(**GRID)
+    ax.set_axisbelow(True)
+    if legend and ax.get_legend_handles_labels()[0]:
+        ax.legend(fontsize=8, loc="best")
+
+
+def _rows(fig: Figure, count: int) -> list[Axes]:
+    fig.set_size_inches(10.0, 1.2 + 2.6 * count)
+    return list(fig.subplots(count, 1, squeeze=False)[:, 0])
+
+
+def signals(rec: Recording, fig: Figure) -> None:
+    """Accelerometer and gyroscope of every sensor by axis, with the norm."""
+    panels = [
+        (t, key, unit)
+        for key, unit in (("acc", "m/s²"), ("gyr", "rad/s"))
+        for t in _topics(rec, [f"{key}_x"], "sensor_msgs/msg/Imu", role="raw")
+    ]
+    _found(rec, "inertial sensor", [t for t, *_ in panels])
+    for ax, (topic, key, unit) in zip(_rows(fig, len(panels)), panels, strict=True):
+        table = rec.table(topic)
+        values, t = table.select(f"{key}_{a}" for a in "xyz").to_numpy(), _s(rec, table)
+        for i, a in enumerate("xyz"):
+            ax.plot(t, values[:, i], color=style.AXES[i], linewidth=0.8, label=a)
+        ax.plot(t, np.linalg.norm(values, axis=1), color=style.NORM, linewidth=0.8, label="norm")
+        _dress(ax, f"{printable(topic)} {key}", TIME, unit)
+
+
+def steps(rec: Recording, fig: Figure) -> None:
+    """Steps on the norm of the accelerometer, their lengths, and the distance so far."""
+    topics = _found(rec, "steps", _topics(rec, ["length_m"], "marcha_msgs/msg/Step"))
+    top, lengths, way = _rows(fig, 3)
+    sensors = _topics(rec, ["acc_x"], "sensor_msgs/msg/Imu", role="raw")
+    norm: tuple[Floats, Floats] | None = None
+    if sensors:
+        table = rec.table(sensors[0])
+        norm = _s(rec, table), np.linalg.norm(table.select("acc_x", "acc_y", "acc_z").to_numpy(), axis=1)
+        top.plot(*norm, color=style.NORM, linewidth=0.7, label=f"‖acc‖ of {printable(sensors[0])}")
+    for topic in topics:
+        table, color = rec.table(topic), _color(rec, topic)
+        t, length = _s(rec, table), table["length_m"].to_numpy()
+        height = np.interp(t, *norm) if norm else np.ones(len(t))
+        top.plot(t, height, "d", color=color, markersize=4, label=f"{_owner(topic)}: {len(t)} steps")
+        lengths.bar(np.arange(1, len(t) + 1), length, color=color, alpha=0.7, label=_owner(topic))
+        way.step(np.arange(1, len(t) + 1), np.nancumsum(length), color=color, label=_owner(topic))
+    _dress(top, "steps along the norm", TIME, "m/s²")
+    _dress(lengths, "step lengths", "step", "m")
+    _dress(way, "distance so far", "step", "m")
+
+
+def heading(rec: Recording, fig: Figure) -> None:
+    """Magnetometer in the plane of the phone, and headings, raw and filtered."""
+    headings = [
+        (t, c)
+        for t in _topics(rec, [], NAMED, role="estimate")
+        if t.endswith("/heading")
+        for c in rec.channels[t].columns
+        if c.endswith("_rad")
+    ]
+    _found(rec, "heading", [t for t, _ in headings])
+    fields = _topics(rec, ["mag_x"], "sensor_msgs/msg/MagneticField")[:1]
+    axes = _rows(fig, 1 + len(fields))
+    for ax, topic in zip(axes, fields, strict=False):
+        table = rec.table(topic)
+        for i, a in enumerate("xy"):
+            ax.plot(_s(rec, table), table[f"mag_{a}"].to_numpy() * 1e6, color=style.AXES[i], label=a)
+        _dress(ax, f"{printable(topic)}", TIME, "µT")
+    for i, (topic, column) in enumerate(headings):
+        table = rec.table(topic).filter(pl.col(column).is_finite())
+        turned = np.degrees(np.unwrap(table[column].to_numpy()))
+        name = f"{_owner(topic)} {column.removesuffix('_rad')}"
+        axes[-1].plot(_s(rec, table), turned, color=style.axis_color(i), linewidth=1.0, label=name)
+    _dress(axes[-1], "heading (unwrapped)", TIME, "°")
+
+
+def fixes(rec: Recording, fig: Figure) -> None:
+    """Fixes with their accuracy, stated tracks and reference: in degrees, and in metres about the first."""
+    topics = _found(rec, "fixes", _topics(rec, ["lat_deg", "lon_deg"]))
+    fig.set_size_inches(13.0, 6.0)
+    degrees, metres = fig.subplots(1, 2)
+    first: Floats | None = None
+    for topic in topics:
+        table = rec.table(topic).filter(pl.col("lat_deg").is_finite() & pl.col("lon_deg").is_finite())
+        if table.is_empty():
+            continue
+        place, color = table.select("lat_deg", "lon_deg").to_numpy(), _color(rec, topic)
+        first = np.array(place[0] if first is None else first)
+        line, known = "-" if is_estimate(topic) else "", {"color": color, "label": _owner(topic)}
+        scale = metres_a_degree(first[:1])[0]
+        degrees.plot(place[:, 1], place[:, 0], linestyle=line, marker=".", **known)
+        local = (place - first) * scale
+        metres.plot(local[:, 1], local[:, 0], linestyle=line, marker=".", **known)
+        if "sd_east_m" in table.columns and not is_estimate(topic):
+            sd = table.select("sd_east_m", "sd_north_m").to_numpy()
+            for ring in (geo_circle(place, sd) - first) * scale:
+                metres.plot(ring[:, 1], ring[:, 0], color=color, linewidth=0.5, alpha=0.6)
+    _dress(degrees, "fixes", "longitude (°)", "latitude (°)")
+    degrees.ticklabel_format(useOffset=False)
+    degrees.tick_params(axis="x", rotation=20)
+    if first is not None:
+        degrees.set_aspect(1.0 / np.cos(np.radians(first[0])))
+    _dress(metres, "about the first fix (circles: ±1σ)", "east (m)", "north (m)")
+    metres.set_aspect("equal", adjustable="datalim")
+
+
+def _traces(rec: Recording) -> dict[str, Trace]:
+    found: dict[str, Trace] = {}
+    for topic in _topics(rec, ["pos_x", "pos_y", "pos_z"], *PLACES):
+        table = rec.table(topic)
+        position = table.select(pl.col("pos_x", "pos_y"), pl.col("pos_z").fill_nan(0.0)).to_numpy()
+        turn = table.select(f"quat_{a}" for a in "wxyz").to_numpy() if "quat_w" in table.columns else None
+        trace = Trace(_owner(topic), _color(rec, topic))
+        trace.add(table["t_ns"].to_numpy(), position, turn)
+        if trace.count:
+            found[topic] = trace
+    return found
+
+
+def floor(rec: Recording, fig: Figure) -> None:
+    """Floor plan with anchors by technology, tracks beside the true path, and 95 % ellipses."""
+    plan, traces = floor_plan(loaders_of(rec)), _traces(rec)
+    if not plan and not traces:
+        raise UsageError(f"{rec.path}: nothing for this figure: neither plan nor anchors nor tracks")
+    fig.set_size_inches(9.0, 7.0)
+    ax = fig.subplots()
+    if plan.picture is not None:
+        ax.imshow(plan.picture, extent=plan.corners, alpha=0.6)
+    for line in plan.outlines:
+        ax.plot(line[:, 0], line[:, 1], color="#777777", linewidth=1.0)
+    for i, kind in enumerate(dict.fromkeys(a.technology for a in plan.anchors.values())):
+        at = np.array([a.position for a in plan.anchors.values() if a.technology == kind])
+        ax.plot(at[:, 0], at[:, 1], "s^vPX*"[i % 6], color="black", label=f"anchors {kind}".strip())
+    for topic, trace in traces.items():
+        p = trace.positions
+        mark = "o" if trace.sparse and is_estimate(topic) else ""
+        ax.plot(p[:, 0], p[:, 1], color=trace.color, marker=mark, markersize=3, label=trace.owner)
+        stated = f"{topic.rpartition('/')[0]}/sigma"
+        if is_estimate(topic) and {"sigma_pos_x", "sigma_pos_y"} <= set(_columns(rec, stated)):
+            table = rec.table(stated)
+            kept = table[:: max(1, table.height // MOST_ELLIPSES)]
+            axes = ELLIPSE95 * kept.select("sigma_pos_x", "sigma_pos_y").to_numpy()
+            for ring in circle(trace.at(kept["t_ns"].to_numpy()), axes):
+                ax.plot(ring[:, 0], ring[:, 1], color=trace.color, linewidth=0.5, alpha=0.5)
+    _dress(ax, "from above (ellipses: 95 %)", "x (m)", "y (m)")
+    ax.set_aspect("equal", adjustable="datalim")
+
+
+def _columns(rec: Recording, topic: str) -> tuple[str, ...]:
+    return rec.channels[topic].columns if topic in rec.channels else ()
+
+
+def radio(rec: Recording, fig: Figure) -> None:
+    """Signal strength by anchor: over time, as histogram, and over the true distance with the model."""
+    topic = _found(rec, "radio signals", _topics(rec, ["mac", "rssi_dbm"]))[0]
+    table = rec.table(topic)
+    anchors = floor_plan(loaders_of(rec)).anchors
+    counts = table.group_by("mac").len().sort("len", descending=True)["mac"].to_list()
+    macs = sorted(counts, key=lambda m: m.lower() not in anchors)[:8]
+    truth = next((t for k, t in _traces(rec).items() if role_of(k) == "reference"), None)
+    beside = truth is not None and any(m.lower() in anchors for m in macs)
+    fig.set_size_inches(6.0 * (2 + beside), 4.5)
+    axes = fig.subplots(1, 2 + beside)
+    for i, mac in enumerate(macs):
+        rows = table.filter(pl.col("mac") == mac)
+        rssi, color = rows["rssi_dbm"].cast(pl.Float64).to_numpy(), style.run_color(i)
+        known = {"color": color, "label": printable(mac)}
+        axes[0].plot(_s(rec, rows), rssi, ".", markersize=3, **known)
+        axes[1].hist(rssi, bins=np.arange(-110.0, 0.0, 2.0), histtype="step", **known)
+        anchor: Anchor | None = anchors.get(mac.lower())
+        if beside and truth is not None and anchor is not None:
+            gone = np.linalg.norm(truth.at(rows["t_ns"].to_numpy()) - anchor.position, axis=1)
+            axes[2].plot(gone, rssi, ".", markersize=3, **known)
+            d = np.geomspace(0.5, max(float(gone.max()), 1.0), 60)
+            axes[2].plot(d, anchor.p_d0 - 10 * anchor.eta * np.log10(d), color=color, linewidth=1.0)
+    _dress(axes[0], f"{printable(topic)}, {len(macs)} of {len(counts)} transmitters", TIME, "dBm")
+    _dress(axes[1], "histogram", "dBm", "packets", legend=False)
+    seen = table["rssi_dbm"].cast(pl.Float64)
+    axes[1].set_xlim(float(seen.min() or -100.0) - 3, float(seen.max() or 0.0) + 3)  # type: ignore[arg-type]
+    if beside:
+        _dress(axes[2], "over the true distance (lines: the anchors' model)", "m", "dBm", legend=False)
+        axes[2].set_xscale("log")
+
+
+def error(rec: Recording, fig: Figure) -> None:
+    """Distance to the reference over time, and its distribution; positions as they are, not aligned."""
+    traces = _traces(rec)
+    references = [t for t in traces if role_of(t) == "reference"]
+    found = {}
+    for topic, trace in traces.items():
+        truth = reference_of(topic.split("/")[2], references) if is_estimate(topic) else None
+        result = compared(trace, traces[truth], "none") if truth else None
+        if result is not None:
+            found[topic] = result
+    _found(rec, "track with a reference", list(found))
+    fig.set_size_inches(12.0, 4.5)
+    over, share = fig.subplots(1, 2)
+    for topic, result in found.items():
+        far, color = distance(result), traces[topic].color
+        over.plot((result.t_ns - (rec.start_ns or 0)) / 1e9, far, color=color, label=_owner(topic))
+        ordered = np.sort(far)
+        at = 100.0 * np.arange(1, len(far) + 1) / len(far)
+        median, p95 = np.percentile(far, [50, 95])
+        name = f"{_owner(topic)}: mean {far.mean():.2f}, median {median:.2f}, 95 % {p95:.2f} m"
+        share.step(ordered, at, color=color, where="post", label=name)
+    _dress(over, "error of the position (not aligned)", TIME, "m", legend=False)
+    _dress(share, "distribution", "error (m)", "% of the samples")
+
+
+def joints(rec: Recording, fig: Figure) -> None:
+    """Joint angles beside reference and encoder, and the error within its stated ±1σ."""
+    angles: dict[str, list[str]] = {}
+    for topic in _found(rec, "joint angles", _topics(rec, [], JOINT)):
+        for name in rec.channels[topic].columns:
+            if not name.endswith((".vel", ".effort")):
+                angles.setdefault(name, []).append(topic)
+    axes = _rows(fig, 2 * len(angles))
+    for (joint, topics), ax, below in zip(angles.items(), axes[::2], axes[1::2], strict=True):
+        curves: dict[str, Curve] = {}
+        for topic in sorted(topics, key=lambda t: ("reference", "raw", "estimate").index(role_of(t))):
+            table, curves[topic] = rec.table(topic), Curve()
+            values = np.degrees(table[joint].to_numpy())
+            curves[topic].add(table["t_ns"].to_numpy(), values)
+            ax.plot(_s(rec, table), values, color=_color(rec, topic), linewidth=1.1, label=_owner(topic))
+        truth = next((t for t in curves if not is_estimate(t)), None)
+        for topic in [t for t in curves if is_estimate(t) and truth]:
+            t_ns, wrong = difference(curves[topic], curves[truth or ""])
+            t, color = (t_ns - (rec.start_ns or 0)) / 1e9, _color(rec, topic)
+            rmse = float(np.sqrt(np.mean(wrong**2))) if len(wrong) else np.nan
+            below.plot(t, wrong, color=color, linewidth=1.0, label=f"{_owner(topic)}: RMSE {rmse:.2f}°")
+            stated = f"{topic.rpartition('/')[0]}/sigma"
+            if joint in _columns(rec, stated):
+                table = rec.table(stated)
+                sd = np.degrees(table[joint].to_numpy())
+                below.fill_between(_s(rec, table), -sd, sd, color=color, alpha=0.2, linewidth=0)
+        printed = printable(joint)
+        _dress(ax, f"{printed} angle", TIME, "°")
+        _dress(below, f"{printed} error to {_owner(truth or 'no reference')} (area: ±1σ)", TIME, "°")
+
+
+def jumps(rec: Recording, fig: Figure) -> None:
+    """State of the jump over time, with the share of each state and the number of changes."""
+    topics = [
+        t for t in _topics(rec, ["state"], NAMED, role="estimate") if "states" in rec.channels[t].metadata
+    ]
+    _found(rec, "named states (metadata `states` of a channel with a column `state`)", topics)
+    for ax, topic in zip(_rows(fig, len(topics)), topics, strict=True):
+        names = [printable(n.strip()) for n in rec.channels[topic].metadata["states"].split(",")]
+        table = rec.table(topic).filter(pl.col("state").is_finite())
+        t, state = _s(rec, table), table["state"].to_numpy()
+        edges = np.flatnonzero(np.diff(state)) + 1
+        starts, ends = np.concatenate([[0], edges]), np.concatenate([edges, [len(state) - 1]])
+        for k, name in enumerate(names):
+            mine = [i for i in range(len(starts)) if len(state) and state[starts[i]] == k]
+            bars = [(float(t[starts[i]]), float(t[ends[i]] - t[starts[i]])) for i in mine]
+            label = f"{name}: {100.0 * float(np.mean(state == k)) if len(state) else 0.0:.0f} %"
+            ax.broken_barh(bars, (k - 0.4, 0.8), facecolors=style.run_color(k), label=label)
+        ax.set_yticks(range(len(names)), names)
+        _dress(ax, f"{_owner(topic)}: state, {len(edges)} changes", TIME, "")
+
+
+FIGURES: dict[str, Callable[[Recording, Any], None]] = {
+    "signals": signals,
+    "steps": steps,
+    "heading": heading,
+    "fixes": fixes,
+    "floor": floor,
+    "radio": radio,
+    "error": error,
+    "joints": joints,
+    "jumps": jumps,
+}
+"""Figures by name, beside ``walk``."""
