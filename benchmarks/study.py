@@ -79,14 +79,12 @@ def _run(workers: int, walks: int, folder: Path) -> None:
     from multiprocessing import forkserver
 
     import msgspec
-    from marcha.ingest import convert
-    from marcha.ingest.simulate import simulate
     from marcha.study import load, run_study
 
     config, _ = load("foot-simulated")
     assert config.simulate is not None
     config = msgspec.structs.replace(config, simulate=msgspec.structs.replace(config.simulate, walks=walks))
-    result = run_study(config, folder, workers=workers, convert=convert, simulate=simulate)
+    result = run_study(config, folder, workers=workers)
     print(time.monotonic())  # a clock that all processes share; the server takes a while to end
     if result.cells_failed:
         raise RuntimeError(f"{result.cells_failed} cells failed: {result.notes[:1]}")

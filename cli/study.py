@@ -52,8 +52,6 @@ def study(
     force : bool
         Start anew in a folder that holds a study.
     """
-    from ..ingest import convert
-    from ..ingest.simulate import simulate
     from ..study import run_study
 
     with progress("study", common) as report:
@@ -63,8 +61,6 @@ def study(
             data=list(data) or None,
             workers=workers,
             scheduler=scheduler,
-            convert=convert,
-            simulate=simulate,
             overwrite=force,
             resume=resume,
             progress=report,

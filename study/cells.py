@@ -9,7 +9,7 @@ import contextlib
 import math
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
@@ -96,32 +96,9 @@ def cached(source: Source, folder: Path) -> Path:
     return folder / f"{source.name.replace('/', '__')}-{source.digest[:8]}.mcap"
 
 
-class Makers(msgspec.Struct, frozen=True):
-    """How raw logs and simulated walks become recordings.
-
-    The rooms that can do this come after this one, so whoever starts a study hands them over; both are
-    module-level functions, so that processes can be sent them.
-
-    Attributes
-    ----------
-    convert : callable or None
-        :func:`marcha.ingest.convert`.
-    simulate : callable or None
-        :func:`marcha.ingest.simulate.simulate`.
-    """
-
-    convert: Callable[..., Any] | None = None
-    simulate: Callable[..., Any] | None = None
-
-    @property
-    def modules(self) -> list[str]:
-        """Names of the modules that they need."""
-        return [f.__module__ for f in (self.convert, self.simulate) if f is not None]
-
-
-def run_task(makers: Makers, task: Task) -> list[Cell]:
+def run_task(task: Task) -> list[Cell]:
     """Do one task: prepare the recording and, unless there are no jobs, replay and evaluate it."""
-    path = prepare(makers, task.source, Path(task.folder))
+    path = prepare(task.source, Path(task.folder))
     if not task.jobs:
         return []
     rec = open_recording(path)
@@ -164,7 +141,7 @@ def _cell(job: Job, source: Source, **values: Any) -> Cell:
     )
 
 
-def prepare(makers: Makers, source: Source, folder: Path) -> Path:
+def prepare(source: Source, folder: Path) -> Path:
     """Return the recording of ``source``: converted, simulated, or the file itself."""
     path = cached(source, folder)
     if path.exists():
@@ -174,13 +151,11 @@ def prepare(makers: Makers, source: Source, folder: Path) -> Path:
         if source.kind == "mcap":
             _with_truth(source, path)
         elif source.kind == "raw":
-            if makers.convert is None:
-                raise MarchaError(
-                    f"{source.path}: is no recording; convert it first, or pass convert=marcha.ingest.convert"
-                )
-            makers.convert([source.path], path, format=source.format, options=source.options)
+            from ..ingest import convert
+
+            convert([source.path], path, format=source.format, options=source.options)
         else:
-            _simulate(makers, source, path)
+            _simulate(source, path)
     return path
 
 
@@ -193,15 +168,14 @@ def _with_truth(source: Source, path: Path) -> None:
         out.add_metadata("truth", {**truth, **rec.metadata.get("truth", {})})
 
 
-def _simulate(makers: Makers, source: Source, path: Path) -> None:
-    if makers.convert is None or makers.simulate is None:
-        raise MarchaError(
-            f"{source.name}: pass simulate=marcha.ingest.simulate.simulate and convert=marcha.ingest.convert"
-        )
+def _simulate(source: Source, path: Path) -> None:
+    from ..ingest import convert
+    from ..ingest.simulate import simulate
+
     raw = Path(tempfile.mkdtemp(prefix=".walk-", dir=path.parent))
     try:
-        walk = makers.simulate(source.scenario, raw, seed=source.seed, **source.options)
-        makers.convert(walk.paths, path)
+        walk = simulate(source.scenario, raw, seed=source.seed, **source.options)
+        convert(walk.paths, path)
     finally:
         shutil.rmtree(raw, ignore_errors=True)
 

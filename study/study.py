@@ -8,7 +8,6 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
-from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from . import analysis, plan
 from . import config as cfg
 from .cells import (
     Cell,
-    Makers,
     cached,
     failed,
     run_task,
@@ -113,6 +111,10 @@ class StudyResult(msgspec.Struct, frozen=True):
         ]
 
 
+LOADED = ("marcha.ingest", "marcha.ingest.simulate")
+"""Modules that every process needs beside the estimators."""
+
+
 def run_study(
     config: str | Path | cfg.StudyConfig,
     out_dir: str | Path,
@@ -120,8 +122,6 @@ def run_study(
     data: str | Path | Sequence[str | Path] | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
-    convert: Callable[..., Any] | None = None,
-    simulate: Callable[..., Any] | None = None,
     overwrite: bool = False,
     resume: bool = False,
     progress: Callable[[float, float], None] | None = None,
@@ -144,9 +144,6 @@ def run_study(
     scheduler : str, optional
         Address of a Dask scheduler instead; its workers must see the data and ``out_dir`` under the same
         paths.
-    convert, simulate : callable, optional
-        :func:`marcha.ingest.convert` and :func:`marcha.ingest.simulate.simulate`, for studies of raw logs and
-        of simulated walks. (This room imports no other that comes after it; the command line passes them.)
     overwrite : bool
         Start anew in a folder that holds a study.
     resume : bool
@@ -170,10 +167,9 @@ def run_study(
     roots = [Path(p) for p in ([data] if isinstance(data, str | Path) else data or ([base] if base else []))]
     folder = Path(out_dir)
     toml = msgspec.toml.encode(_plain(config)).decode()
-    makers = Makers(convert, simulate)
     with Executor(workers, scheduler) as executor:
         # First of all: the processes load what they need while this one looks for mistakes and recordings.
-        executor.warm_up(makers.modules, [e.name for e in config.estimators])
+        executor.warm_up(LOADED, [e.name for e in config.estimators])
         methods = cfg.methods(config)
         code = plan.code_digest(m.estimator for m in methods)
         plan.check_methods(methods)
@@ -190,10 +186,9 @@ def run_study(
             progress(done, total)
         from scipy import stats  # noqa: F401  # a second that passes here while the processes start
 
-        function = partial(run_task, makers)
-        for _ in executor.run(function, plan.preparations(todo)):
+        for _ in executor.run(run_task, plan.preparations(todo)):
             pass  # what cannot be prepared fails again, and is recorded, in its own tasks
-        for task, outcome in executor.run(function, todo):
+        for task, outcome in executor.run(run_task, todo):
             cells = failed(task, outcome) if isinstance(outcome, Exception) else outcome
             store.add(task.name, cells)
             for job in task.jobs:

@@ -15,8 +15,6 @@ from typing import Any
 import msgspec
 import polars as pl
 import pytest
-from marcha.ingest import convert
-from marcha.ingest.simulate import simulate
 from marcha.recording import UsageError
 from marcha.recording import open as open_recording
 from marcha.replay import replay
@@ -60,7 +58,6 @@ metric = "EP"
 origin = "made up"
 rows = { 9IEZ = { C33 = 1.5 } }
 """
-MAKERS: dict[str, Any] = {"convert": convert, "simulate": simulate}
 
 
 def config(**changes: Any) -> StudyConfig:
@@ -90,7 +87,7 @@ def two_figures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def finished(fixed_code: None, tmp_path_factory: pytest.TempPathFactory) -> StudyResult:
-    return run_study(config(), tmp_path_factory.mktemp("study") / "out", workers=1, **MAKERS)
+    return run_study(config(), tmp_path_factory.mktemp("study") / "out", workers=1)
 
 
 @pytest.fixture
@@ -214,7 +211,7 @@ def test_finished_cells_are_not_run_again(
     finished: StudyResult, copy: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(study_module, "run_task", no_replay)
-    again = run_study(config(), copy, workers=1, **MAKERS)
+    again = run_study(config(), copy, workers=1)
     assert (again.cells_run, again.cells_reused, again.cells_failed) == (0, 12, 0)
     assert again.results.equals(finished.results)
 
@@ -229,9 +226,9 @@ def test_ctrl_c_keeps_the_finished_cells(tmp_path: Path) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_study(config(), tmp_path / "out", workers=1, progress=interrupt, **MAKERS)
+        run_study(config(), tmp_path / "out", workers=1, progress=interrupt)
     assert not (tmp_path / "out" / "results.parquet").exists()
-    after = run_study(config(), tmp_path / "out", workers=1, **MAKERS)
+    after = run_study(config(), tmp_path / "out", workers=1)
     assert (after.cells_run, after.cells_reused) == (8, 4)
 
 
@@ -245,7 +242,7 @@ def test_an_added_filter_runs_alone(copy: Path) -> None:
             msgspec.structs.replace(more.estimators[1], label="x", params={"gravity": 9.8}),
         ],
     )
-    again = run_study(more, copy, workers=1, resume=True, **MAKERS)
+    again = run_study(more, copy, workers=1, resume=True)
     assert (again.cells_run, again.cells_reused) == (6, 12)
 
 
@@ -253,14 +250,14 @@ def test_an_added_filter_runs_alone(copy: Path) -> None:
 def test_another_study_is_not_overwritten(copy: Path) -> None:
     before = (copy / "results.parquet").read_bytes()
     with pytest.raises(UsageError, match="another configuration"):
-        run_study(config(title="other"), copy, workers=1, **MAKERS)
+        run_study(config(title="other"), copy, workers=1)
     assert (copy / "results.parquet").read_bytes() == before
 
 
 def test_a_folder_of_other_things_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work", encoding="utf-8")
     with pytest.raises(UsageError, match="holds no study"):
-        run_study(config(), tmp_path, workers=1, overwrite=True, **MAKERS)
+        run_study(config(), tmp_path, workers=1, overwrite=True)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.tex"]
 
 
@@ -268,7 +265,7 @@ def test_a_folder_of_other_things_is_left_alone(tmp_path: Path) -> None:
 def test_a_damaged_cell_file_is_run_again(finished: StudyResult, copy: Path) -> None:
     victim = next((copy / "cells").iterdir())
     victim.write_bytes(victim.read_bytes()[:-7])
-    again = run_study(config(), copy, workers=1, **MAKERS)
+    again = run_study(config(), copy, workers=1)
     assert (again.cells_run, again.cells_reused) == (2, 10)
     assert same_apart_from_times(again.results, finished.results)
 
@@ -330,20 +327,13 @@ def test_truth_of_the_study_reaches_recordings_that_lack_it(finished: StudyResul
 def test_a_wrong_parameter_is_said_before_anything_runs(tmp_path: Path) -> None:
     wrong = msgspec.structs.replace(config().estimators[1], params={"sigma_speed": 1})
     with pytest.raises(UsageError, match="sigma_speed"):
-        run_study(config(estimators=[wrong]), tmp_path / "out", workers=1, **MAKERS)
+        run_study(config(estimators=[wrong]), tmp_path / "out", workers=1)
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.usefixtures("no_figures")
-def test_a_raw_study_without_importers_says_what_to_pass(tmp_path: Path) -> None:
-    result = run_study(config(), tmp_path / "out", workers=1)
-    assert result.cells_failed == 12
-    assert "pass simulate=" in result.notes[0]
 
 
 @pytest.mark.usefixtures("two_figures")
 def test_two_processes_give_the_same_results(finished: StudyResult, tmp_path: Path) -> None:
-    result = run_study(config(), tmp_path / "out", workers=2, **MAKERS)
+    result = run_study(config(), tmp_path / "out", workers=2)
     assert same_apart_from_times(result.results, finished.results)
     assert result.comparisons.equals(finished.comparisons)
 
@@ -359,20 +349,20 @@ def cluster() -> Iterator[str]:
 
 @pytest.mark.usefixtures("no_figures")
 def test_a_dask_cluster_gives_the_same_results(finished: StudyResult, cluster: str, tmp_path: Path) -> None:
-    result = run_study(config(), tmp_path / "out", scheduler=cluster, **MAKERS)
+    result = run_study(config(), tmp_path / "out", scheduler=cluster)
     assert same_apart_from_times(result.results, finished.results)
     assert result.groups.drop("note").equals(finished.groups.drop("note"))
 
 
 def test_a_scheduler_and_workers_exclude_each_other(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="either workers or a scheduler"):
-        run_study(config(), tmp_path / "out", scheduler="tcp://127.0.0.1:1", workers=2, **MAKERS)
+        run_study(config(), tmp_path / "out", scheduler="tcp://127.0.0.1:1", workers=2)
 
 
 def test_without_dask_one_line_names_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "dask", None)
     with pytest.raises(UsageError, match=r"marcha\[cluster\]"):
-        run_study(config(), tmp_path / "out", scheduler="tcp://127.0.0.1:1", **MAKERS)
+        run_study(config(), tmp_path / "out", scheduler="tcp://127.0.0.1:1")
 
 
 def test_importing_the_study_loads_nothing_heavy() -> None:
