@@ -15,6 +15,8 @@ from typing import Any
 import msgspec
 import polars as pl
 import pytest
+from marcha.ingest import convert
+from marcha.ingest.simulate import simulate
 from marcha.recording import UsageError
 from marcha.recording import open as open_recording
 from marcha.replay import replay
