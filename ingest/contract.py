@@ -40,6 +40,10 @@ class CommonOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     start: Annotated[
         str | None, msgspec.Meta(description="UTC time (ISO 8601) of the first sample; makes the clock UTC")
     ] = None
+    unpack_limit_gb: Annotated[
+        Annotated[float, msgspec.Meta(gt=0)],
+        msgspec.Meta(description="most that a zip archive may unpack to, GB"),
+    ] = 2.0
     keep_source: Annotated[bool, msgspec.Meta(description="attach the raw source files to the recording")] = (
         False
     )

@@ -16,6 +16,7 @@ from ..recording.errors import MarchaError, OutputExists, UsageError
 from ..recording.provenance import provenance
 from ..recording.threads import Ahead, helpers
 from . import registry
+from .archive import UNPACK_LIMIT_GB
 from .contract import (
     ChannelSpec,
     CommonOptions,
@@ -108,7 +109,7 @@ def convert(
     if out.exists() and not overwrite:
         raise OutputExists(out)
     with contextlib.ExitStack() as stack:
-        found = registry.choose(sources, format, stack, mapped=mapped)
+        found = registry.choose(sources, format, stack, mapped=mapped, unpack_limit_gb=_limit(options or {}))
         settings = registry.share_options(found, chosen)
         truths = [read_truth(source.files[0]) for source in found]
         facts = {
@@ -266,6 +267,15 @@ class _Writer:
             ConvertedChannel(topic, self._specs[topic].schema, *numbers)
             for topic, numbers in self._counts.items()
         ]
+
+
+def _limit(chosen: Mapping[str, Any]) -> float:
+    """Return how much an archive may unpack to (GB): needed before the format is known."""
+    value = chosen.get("unpack_limit_gb", UNPACK_LIMIT_GB)
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise UsageError(f"option unpack_limit_gb={value!r} is no number of GB") from None
 
 
 def _instant(option: str, text: str) -> int:

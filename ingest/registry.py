@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import tempfile
 import warnings
-import zipfile
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
@@ -15,6 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ..recording.errors import MarchaError, UsageError
+from .archive import UNPACK_LIMIT_GB, is_zip, unpack
 from .contract import HEAD_BYTES, CommonOptions, Importer
 from .truth import is_side_file
 
@@ -181,7 +181,12 @@ class Chosen(NamedTuple):
 
 
 def choose(
-    paths: Sequence[Path], format: str | None, stack: contextlib.ExitStack, *, mapped: str | None = None
+    paths: Sequence[Path],
+    format: str | None,
+    stack: contextlib.ExitStack,
+    *,
+    mapped: str | None = None,
+    unpack_limit_gb: float = UNPACK_LIMIT_GB,
 ) -> list[Chosen]:
     """Find the importers of a recording's sources, and the files or folders to hand to each.
 
@@ -197,6 +202,8 @@ def choose(
         Name of the format; without it content decides.
     stack : contextlib.ExitStack
         Keeps unpacked archives until it is closed.
+    unpack_limit_gb : float
+        Most that an archive may unpack to (GB).
     mapped : str, optional
         Format of inputs whose content belongs to none: that of a mapping which was given.
 
@@ -213,7 +220,7 @@ def choose(
         if mapped is not None and Path(path).is_file() and not recognise(Path(path)):
             chosen.append((mapped, Path(path)))
         else:
-            chosen += _resolve(Path(path), wanted, stack)
+            chosen += _resolve(Path(path), wanted, stack, unpack_limit_gb)
     sources: list[Chosen] = []
     for name in dict.fromkeys(name for name, _ in chosen):
         registered = get(name)
@@ -262,20 +269,24 @@ def share_options(sources: Sequence[Chosen], values: Mapping[str, Any]) -> list[
     return [make_options(r.importer, chosen) for (r, _), chosen in zip(sources, given, strict=True)]
 
 
-def _resolve(path: Path, wanted: Registered | None, stack: contextlib.ExitStack) -> list[tuple[str, Path]]:
+def _resolve(
+    path: Path, wanted: Registered | None, stack: contextlib.ExitStack, limit_gb: float
+) -> list[tuple[str, Path]]:
     """Return (format, file or folder) of everything that one input holds."""
     if not path.exists():
         raise MarchaError(f"{path}: no such file or folder")
     folders = wanted is not None and getattr(wanted.importer, "folders", False)
-    whole = _candidates(path, wanted)
+    archive = path.is_file() and is_zip(path)
+    # What a member stores uncompressed stands in the archive as it is: it must not be taken for the log itself.
+    whole = [] if archive else _candidates(path, wanted)
     if not whole and wanted is not None and folders and path.is_dir():
         return [(wanted.importer.name, path)]
     if whole:
         return [(whole[0].name, path)]
     if path.is_dir():
         folder = path
-    elif zipfile.is_zipfile(path):
-        folder = _unpack(path, stack)
+    elif archive:
+        folder = _unpack(path, stack, limit_gb)
         if inner := _candidates(folder, wanted):
             return [(inner[0].name, folder)]
         if wanted is not None and folders:
@@ -341,15 +352,9 @@ def _head(path: Path) -> bytes:
         raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def _unpack(path: Path, stack: contextlib.ExitStack) -> Path:
+def _unpack(path: Path, stack: contextlib.ExitStack, limit_gb: float) -> Path:
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="marcha-")))
-    try:
-        with zipfile.ZipFile(path) as archive:
-            archive.extractall(folder)
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, RuntimeError, NotImplementedError, EOFError) as error:
-        raise MarchaError(f"{path}: the zip archive cannot be unpacked: {error}") from error
-    except OSError as error:
-        raise MarchaError(f"{path}: cannot be unpacked: {error.strerror or error}") from error
+    unpack(path, folder, limit_gb)
     return folder
 
 

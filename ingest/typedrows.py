@@ -26,6 +26,7 @@ def typed_blocks(
     required: Callable[[str], str],
     texts: Collection[str] = (),
     comment: str = "#",
+    ending: str = "",
 ) -> Iterator[dict[str, pl.DataFrame]]:
     """Yield for each block of text the rows of every kind: ``line`` and its columns, numbers as Float64.
 
@@ -48,6 +49,8 @@ def typed_blocks(
         Columns that stay text.
     comment : str
         Lines that begin so are no rows.
+    ending : str
+        Characters that may close a row and are no cell.
     """
     line = 1
     for k, (piece, _) in enumerate(read_blocks(path)):
@@ -61,6 +64,8 @@ def typed_blocks(
             {"row": rows, "line": range(line, line + rows.len())}, schema_overrides={"line": pl.Int64}
         )
         line += rows.len()
+        if ending:
+            table = table.with_columns(pl.col("row").str.strip_chars_end(ending))
         table = table.with_columns(kind=pl.col("row").str.extract(pattern))
         blank = pl.col("row").str.strip_chars() == ""
         odd = table.filter(pl.col("kind").is_null() & ~blank & ~pl.col("row").str.starts_with(comment))

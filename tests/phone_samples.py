@@ -176,3 +176,115 @@ def rtk_pos(path: Path, walk: PhoneWalk) -> Path:
         rows.append(f"{date} {time}   {cells[0]}   {cells[1]}   {walk.options.alt_m + pos[2]:.3f}")
     path.write_text("\r\n".join([*rows, ""]))
     return path
+
+
+def android_text(path: Path, walk: PhoneWalk, columns: int = 10) -> Path:
+    """Write the Android text of the source: @ lines, rows that end in #."""
+    place = held_fixes(walk)
+    rows = ["@Date: Mon Mar 09 08:51:47 GMT-03:00 2026", "@ SamplingTime: 50ms", ""]
+    for k, t in enumerate(walk.t_ns // 1_000_000):
+        if not np.isnan(place[k, 0]):
+            values = [*walk.acc_b[k], *walk.mag_b[k] * 1e6, *place[k, :3]][: columns - 1]
+            rows.append(f"{t}," + ",".join(f"{v:.12g}" for v in values) + "#")
+    path.write_text("\n".join([*rows, ""]))
+    return path
+
+
+def getsensordata(path: Path, walk: PhoneWalk) -> Path:
+    """Write typed rows with two clocks: the app's is up to 4 ms late, the sensor's began elsewhere."""
+    rows = ["% GetSensorData", "% Date of recording: Mon Mar 09 08:51:47"]
+    late = np.random.default_rng(1).uniform(0, 0.004, len(walk.t_ns))
+    for k, s in enumerate(seconds(walk)):
+        for kind, values in (("ACCE", walk.acc_b[k]), ("GYRO", walk.gyr_b[k]), ("MAGN", walk.mag_b[k] * 1e6)):
+            rows.append(
+                f"{kind};{s + late[k]:.6f};{s + 9000:.6f};" + ";".join(f"{v:.9g}" for v in values) + ";3"
+            )
+        if k % 100 == 10:
+            rows.append(f"WIFI;{s:.3f};{s + 9000:.3f};guest;16:74:9c:2b:4d:1b;-41;")
+    o = walk.options
+    rows.append(f"POSI;{seconds(walk)[-1]:.3f};1;{o.lat_deg};{o.lon_deg};0;0")
+    path.write_text("\n".join([*rows, ""]))
+    return path
+
+
+def gnsslogger(path: Path, walk: PhoneWalk) -> Path:
+    """Write GnssLogger's text: uncalibrated readings with their bias."""
+    rows = [
+        "# Version: v3",
+        "# Fix,Provider,LatitudeDegrees,LongitudeDegrees,AltitudeMeters,SpeedMps,AccuracyMeters,BearingDegrees,"
+        "UnixTimeMillis",
+    ]
+    for kind, unit in (("Accel", "Mps2"), ("Gyro", "RadPerSec"), ("Mag", "MicroT")):
+        axes = ",".join(f"Uncal{kind}{a}{unit}" for a in "XYZ")
+        drift = "Drift" if kind == "Gyro" else "Bias"
+        bias = ",".join(f"{'Bias' if drift == 'Bias' else 'Drift'}{a}{unit}" for a in "XYZ")
+        rows.append(f"# Uncal{kind},utcTimeMillis,elapsedRealtimeNanos,{axes},{bias}")
+    for f in walk.fixes.iter_rows(named=True):
+        rows.append(
+            f"Fix,GPS,{f['lat_deg']:.9f},{f['lon_deg']:.9f},{f['alt_m']:.3f},1.2,4.5,,{f['t_ns'] // 1_000_000}"
+        )
+    rows.append("Raw,1,2,3")
+    for k, t in enumerate(walk.t_ns // 1_000_000):
+        for kind, values, bias in (
+            ("Accel", walk.acc_b[k] + 0.5, 0.5),
+            ("Mag", walk.mag_b[k] * 1e6 + 20, 20),
+        ):
+            cells = [*(f"{v:.9g}" for v in values), *[str(bias)] * 3]
+            rows.append(f"Uncal{kind},{t},{t * 1000}," + ",".join(cells))
+    path.write_text("\n".join([*rows, ""]))
+    return path
+
+
+def gpx(path: Path, walk: PhoneWalk) -> Path:
+    """Write a GPX track of the fixes."""
+    points = "".join(
+        f'<trkpt lat="{f["lat_deg"]:.9f}" lon="{f["lon_deg"]:.9f}"><ele>{f["alt_m"]:.2f}</ele>'
+        f"<time>{np.datetime64(f['t_ns'], 'ns').astype('datetime64[ms]')}Z</time></trkpt>"
+        for f in walk.fixes.iter_rows(named=True)
+    )
+    path.write_text(
+        f'<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{points}</trkseg></trk></gpx>'
+    )
+    return path
+
+
+def kml(path: Path, walk: PhoneWalk) -> Path:
+    """Write a KML gx:Track of the fixes."""
+    rows = list(walk.fixes.iter_rows(named=True))
+    when = "".join(f"<when>{np.datetime64(f['t_ns'], 'ns').astype('datetime64[ms]')}Z</when>" for f in rows)
+    coord = "".join(
+        f"<gx:coord>{f['lon_deg']:.9f} {f['lat_deg']:.9f} {f['alt_m']:.2f}</gx:coord>" for f in rows
+    )
+    spaces = 'xmlns="http://www.opengis.net/kml/2.2" xmlns:gx="http://www.google.com/kml/ext/2.2"'
+    path.write_text(f"<kml {spaces}><Placemark><gx:Track>{when}{coord}</gx:Track></Placemark></kml>")
+    return path
+
+
+def sensor_logger(folder: Path, walk: PhoneWalk, platform: str = "android", standard: bool = False) -> Path:
+    """Write Sensor Logger's folder: the accelerometer without gravity; iOS turns both unless standardised."""
+    sign = -1.0 if platform == "ios" and not standard else 1.0
+    gravity = np.tile(walk.acc_b[:100].mean(axis=0), (len(walk.t_ns), 1))
+    elapsed = seconds(walk)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, values in (
+        ("Accelerometer", sign * (walk.acc_b - gravity)),
+        ("Gravity", sign * gravity),
+        ("Gyroscope", walk.gyr_b),
+        ("Magnetometer", walk.mag_b * 1e6),
+    ):
+        rows = (
+            f"{t},{s:.9f}," + ",".join(f"{v:.9g}" for v in row[::-1])
+            for t, s, row in zip(walk.t_ns, elapsed, values, strict=True)
+        )
+        (folder / f"{name}.csv").write_text("\n".join(["time,seconds_elapsed,z,y,x", *rows, ""]))
+    rows = [
+        f"{f[0] * 1e9 + walk.t_ns[0]:.0f},{f[0]:.6f},{f[7]:.6f},{f[6]:.6f},-1,-1,{f[3]:.4f},{f[2]:.12f},{f[1]:.12f}"
+        for f in fixes(walk)
+    ]
+    head = (
+        "time,seconds_elapsed,verticalAccuracy,horizontalAccuracy,speed,bearing,altitude,longitude,latitude"
+    )
+    (folder / "Location.csv").write_text("\n".join([head, *rows, ""]))
+    about = f"version,device name,platform,standardisation\n3,Phone,{platform},{str(standard).lower()}\n"
+    (folder / "Metadata.csv").write_text(about)
+    return folder

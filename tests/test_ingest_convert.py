@@ -250,8 +250,8 @@ def test_unknown_option_and_value(walk: Path, tmp_path: Path) -> None:
         convert(walk, tmp_path / "out.mcap", options={"length_m": "far"})
     with pytest.raises(UsageError, match="option conf='9999'"):
         convert(walk, tmp_path / "out.mcap", options={"conf": "9999"})
-    with pytest.raises(UsageError, match="unknown format 'gpx'; one of"):
-        convert(walk, tmp_path / "out.mcap", format="gpx")
+    with pytest.raises(UsageError, match="unknown format 'fax'; one of"):
+        convert(walk, tmp_path / "out.mcap", format="fax")
     with pytest.raises(UsageError, match="start='yesterday'"):
         convert(walk, tmp_path / "out.mcap", options={"start": "yesterday"})
     assert leftovers(tmp_path) == []

@@ -1,0 +1,93 @@
+"""Zip archives from strangers: unpacked only where nothing in them can do harm."""
+
+from __future__ import annotations
+
+import shutil
+import stat
+import zipfile
+from pathlib import Path, PurePosixPath
+
+from ..recording.errors import MarchaError
+
+UNPACK_LIMIT_GB = 2.0
+"""Total that an archive may unpack to, unless an option raises it."""
+MEMBERS, NAME_BYTES = 10_000, 200
+"""Most members, and bytes of one part of a name."""
+
+
+def is_zip(path: Path) -> bool:
+    """Whether a file is a zip archive, by its structure: the compression of its members does not matter."""
+    try:
+        with path.open("rb") as f:
+            return f.read(4) in (b"PK\x03\x04", b"PK\x05\x06") and zipfile.is_zipfile(path)
+    except OSError:
+        return False
+
+
+def unpack(path: Path, folder: Path, limit_gb: float = UNPACK_LIMIT_GB) -> None:
+    """Unpack an archive into an empty folder.
+
+    Raises
+    ------
+    MarchaError
+        A name leads out of the folder, stands twice or is too long; a member is a link or encrypted; the whole is
+        larger than the limit, or says another size than it has.
+    """
+    limit = limit_gb * 1e9
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            if len(members) > MEMBERS:
+                raise MarchaError(
+                    f"{path}: the archive has {len(members)} members, more than {MEMBERS}; unpack it first"
+                )
+            seen: set[str] = set()
+            for member in members:
+                _check(path, member, seen)
+            total = sum(m.file_size for m in members)
+            if total > limit:
+                raise MarchaError(_too_large(path, total, limit_gb))
+            done = 0
+            for member in members:
+                target = folder.joinpath(*PurePosixPath(member.filename.replace("\\", "/")).parts)
+                if member.is_dir():
+                    target.mkdir(parents=True, exist_ok=True)
+                    continue
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with archive.open(member) as source, target.open("wb") as out:
+                    while chunk := source.read(1 << 20):
+                        done += len(chunk)
+                        if done > limit:
+                            raise MarchaError(_too_large(path, done, limit_gb))
+                        out.write(chunk)
+    except (zipfile.BadZipFile, zipfile.LargeZipFile, RuntimeError, NotImplementedError, EOFError) as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise MarchaError(f"{path}: the zip archive cannot be unpacked: {error}") from error
+    except OSError as error:
+        raise MarchaError(f"{path}: cannot be unpacked: {error.strerror or error}") from error
+
+
+def _too_large(path: Path, size: float, limit_gb: float) -> str:
+    return (
+        f"{path}: the archive unpacks to {size / 1e9:.1f} GB, more than {limit_gb:g} GB; if you trust it, "
+        "give --set unpack_limit_gb=…"
+    )
+
+
+def _check(path: Path, member: zipfile.ZipInfo, seen: set[str]) -> None:
+    name = member.filename.replace("\\", "/")
+    parts = PurePosixPath(name).parts
+    shown = name if len(name) < 60 else f"{name[:57]}…"
+    if name.startswith("/") or ".." in parts or (parts and ":" in parts[0]):
+        raise MarchaError(
+            f"{path}: member {shown!r} leads out of the folder; the archive is not to be trusted"
+        )
+    if any(len(p.encode()) > NAME_BYTES for p in parts) or len(parts) > 32:
+        raise MarchaError(f"{path}: member {shown!r} has too long a name; rename it")
+    if name.casefold().rstrip("/") in seen:
+        raise MarchaError(f"{path}: member {shown!r} stands twice; which one is meant cannot be known")
+    seen.add(name.casefold().rstrip("/"))
+    if stat.S_ISLNK(member.external_attr >> 16):
+        raise MarchaError(f"{path}: member {shown!r} is a link; the archive is not to be trusted")
+    if member.flag_bits & 0x1:
+        raise MarchaError(f"{path}: member {shown!r} is encrypted; unpack it with its password first")

@@ -1,0 +1,176 @@
+"""GetSensorData (IPIN): rows ``ACCE;app time;sensor time;…``, signals, and ``POSI``: surveyed positions.
+
+The app's clock (s since the start) is common to all rows but late by the time of handing over; the sensor's clock is
+exact with an origin of its own. Rows get the sensor's time, moved by the median difference of the two.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import polars as pl
+
+from ..contract import CommonOptions, Import, ReportBuilder
+from ..inertial import one_file
+from ..phonelog import (
+    ACC,
+    AXES,
+    FIELD,
+    FIX,
+    GYR,
+    HECTOPASCAL,
+    MAG,
+    MICROTESLA,
+    PRESSURE,
+    QUAT,
+    QUATERNION,
+    RADIO,
+    Part,
+    Source,
+    Stream,
+    declared,
+    fix_part,
+    imu_part,
+    require_rows,
+    rotation_vector,
+    whole_ns,
+    xyz,
+)
+from ..text import read_blocks
+from ..typedrows import typed_blocks
+from .indoor_location import radio_columns, radio_frame
+
+_ROW = re.compile(rb"(?m)^(?:ACCE|GYRO|MAGN|PRES|AHRS|GNSS|WIFI|BLE4|BLUE|POSI|LIGH);-?\d+(?:\.\d+)?;")
+_AXES = ("", "app", "t", "x", "y", "z")
+KINDS: dict[str, tuple[str, ...]] = {
+    "ACCE": _AXES,
+    "GYRO": _AXES,
+    "MAGN": _AXES,
+    "PRES": ("", "app", "t", "x"),
+    "AHRS": ("", "app", "t", "", "", "", "x", "y", "z"),
+    "GNSS": ("", "app", "t", "lat", "lon", "alt", "", "accuracy"),
+    "WIFI": ("", "app", "t", "", "mac", "rssi"),
+    "BLE4": ("", "app", "t", "", "mac", "rssi"),
+    "BLUE": ("", "app", "t", "", "mac", "rssi"),
+    "POSI": ("", "app", "", "lat", "lon"),
+}
+_WIFI_NEW = ("", "app", "t", "", "mac", "frequency", "rssi")
+_TOPICS = {
+    "ACCE": "/phone/acc",
+    "GYRO": "/phone/gyr",
+    "MAGN": "/phone/mag",
+    "PRES": "/phone/pressure",
+    "AHRS": "/phone/orientation",
+    "GNSS": "/phone/gnss",
+    "WIFI": "/phone/radio",
+    "BLE4": "/phone/radio",
+    "BLUE": "/phone/radio",
+    "POSI": "/reference/fix",
+}
+_SAME_CLOCK_S = 0.5
+"""Two clocks run alike where their difference varies less in a block."""
+
+
+class GetSensorDataOptions(CommonOptions, frozen=True, kw_only=True):
+    """No options of its own; ``start`` gives the UTC time of the first row."""
+
+
+class GetSensorData:
+    """Importer ``getsensordata``: ``/phone/…``, ``/phone/radio``, ``/reference/fix``."""
+
+    name: ClassVar[str] = "getsensordata"
+    title: ClassVar[str] = "GetSensorData text (IPIN): ACCE;…, GYRO;…, WIFI;…, POSI;…"
+    Options = GetSensorDataOptions
+
+    def sniff(self, head: bytes, path: Path) -> float:
+        """Rows of four capitals and a time."""
+        return 0.95 if len(_ROW.findall(head)) >= 3 else 0.0
+
+    def read(self, paths: Sequence[Path], options: GetSensorDataOptions) -> Import:
+        """Read one file."""
+        path = one_file(paths, self.name)
+        report = ReportBuilder()
+        there: set[str] = set()
+        for piece, _ in read_blocks(path):
+            there |= {k for k in KINDS if piece.startswith(f"{k};".encode()) or f"\n{k};".encode() in piece}
+        topics = dict.fromkeys(topic for kind, topic in _TOPICS.items() if kind in there)
+        streams = {topic: _stream(topic, report) for topic in topics}
+        return Import(
+            channels=declared(streams.values()),
+            blocks=_blocks(path, streams, report),
+            report=report,
+            metadata={
+                "device": {
+                    "clock": "device",
+                    "time": "sensor time moved to the app's clock (s since the start) by the median difference",
+                    "name": "GetSensorData",
+                    "frames": AXES,
+                    "converted": "magnetic field from µT, pressure from hPa, AHRS rotation vector to a rotation",
+                }
+            },
+        )
+
+
+def _stream(topic: str, report: ReportBuilder) -> Stream:
+    axes = ("x", "y", "z")
+    if topic == "/phone/radio":
+        return Stream([Part(topic, RADIO, radio_columns)], report, subject="signals", events=True)
+    if topic == "/reference/fix":
+        columns = {"lat_deg": Source("lat", 1.0), "lon_deg": Source("lon", 1.0)}
+        part = Part(topic, FIX, columns, frame_id="wgs84", metadata={"source": "surveyed points"})
+        return Stream([part], report, subject="surveyed points", events=True)
+    parts = {
+        "/phone/acc": imu_part(topic, xyz(ACC, axes), gravity="included"),
+        "/phone/gyr": imu_part(topic, xyz(GYR, axes)),
+        "/phone/mag": Part(topic, MAG, xyz(FIELD, axes, MICROTESLA)),
+        "/phone/pressure": Part(topic, PRESSURE, {"pressure_pa": Source("x", HECTOPASCAL)}),
+        "/phone/orientation": Part(topic, QUATERNION, _rotation, QUAT, metadata={"north": "magnetic"}),
+        "/phone/gnss": fix_part({"lat": "lat", "lon": "lon", "alt": "alt", "accuracy": "accuracy"}),
+    }
+    return Stream([parts[topic]], report, subject=topic, even=topic != "/phone/gnss")
+
+
+def _rotation(frame: pl.DataFrame) -> dict[str, np.ndarray]:
+    return rotation_vector(*(frame[a].to_numpy() for a in "xyz"))
+
+
+def _blocks(
+    path: Path, streams: dict[str, Stream], report: ReportBuilder
+) -> Iterator[tuple[str, pl.DataFrame]]:
+    offsets: dict[str, float | None] = {}
+
+    def kinds(kind: str, width: int) -> Sequence[str] | None:
+        return _WIFI_NEW if kind == "WIFI" and width >= 7 else KINDS.get(kind)
+
+    tables = typed_blocks(
+        path,
+        r"^([A-Z0-9]{4});",
+        ";",
+        kinds,
+        report,
+        required=lambda kind: "app",
+        texts=("mac",),
+        comment="%",
+        ending="; \t",
+    )
+    for block in tables:
+        for kind, frame in block.items():
+            seconds = frame["app"]
+            if "t" in frame.columns and kind not in ("WIFI", "BLE4", "BLUE"):
+                if kind not in offsets:
+                    gap = (frame["app"] - frame["t"]).to_numpy()
+                    alike = np.isfinite(gap).all() and np.ptp(gap) < _SAME_CLOCK_S
+                    offsets[kind] = float(np.median(gap)) if alike else None
+                if (offset := offsets[kind]) is not None:
+                    seconds = frame["t"].fill_nan(None).fill_null(frame["app"] - offset) + offset
+            frame = frame.with_columns(t=whole_ns(seconds, 1e6)).drop("app")
+            if _TOPICS[kind] == "/phone/radio":
+                frame = radio_frame(frame, "wifi" if kind == "WIFI" else "ble", report)
+            yield from streams[_TOPICS[kind]].push(frame)
+    for stream in streams.values():
+        yield from stream.finish()
+    require_rows(path, list(streams.values()))

@@ -1,0 +1,310 @@
+"""Sensor Logger: a zip or folder of CSV files, one JSON file, or one SQLite database.
+
+``Accelerometer`` has no gravity: with it is ``TotalAcceleration`` (Android) or the sum with ``Gravity``. On iOS
+acceleration and gravity have the opposite sign unless "Standardise Units & Frames" was on; ``Metadata`` says both.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+import msgspec
+import numpy as np
+import polars as pl
+
+from ...recording.errors import MarchaError
+from ..checks import STANDARD_GRAVITY
+from ..columns import find_header, float_blocks, require_header
+from ..contract import CommonOptions, Import, ReportBuilder, SourceAttachment
+from ..phonelog import (
+    ACC,
+    AXES,
+    FIELD,
+    GYR,
+    HECTOPASCAL,
+    MAG,
+    MICROTESLA,
+    PRESSURE,
+    VALUES,
+    Part,
+    Source,
+    Stream,
+    declared,
+    fix_part,
+    imu_part,
+    require_rows,
+    xyz,
+)
+from ..text import start_of
+
+WANTED = "time,seconds_elapsed,z,y,x"
+READ = (
+    "Accelerometer", "TotalAcceleration", "Gravity", "AccelerometerUncalibrated", "Gyroscope",
+    "GyroscopeUncalibrated", "Magnetometer", "MagnetometerUncalibrated", "Location", "LocationGps", "Barometer",
+    "Pedometer",
+)  # fmt: skip
+_TEXT = ("sensor", "name", "text", "standardisation")
+
+
+class SensorLoggerOptions(CommonOptions, frozen=True, kw_only=True):
+    """What the export does not say where its metadata are missing.
+
+    Attributes
+    ----------
+    platform : str or None
+        ``android`` or ``ios``.
+    standardised : bool or None
+        Whether "Standardise Units & Frames" was on.
+    """
+
+    platform: Annotated[
+        Literal["android", "ios"] | None, msgspec.Meta(description="platform, where no metadata say it")
+    ] = None
+    standardised: Annotated[
+        bool | None, msgspec.Meta(description="Standardise Units & Frames was on, where no metadata say it")
+    ] = None
+
+
+class SensorLogger:
+    """Importer ``sensor-logger``: ``/phone/acc``, ``/phone/gyr``, ``/phone/mag``, ``/phone/gnss`` …"""
+
+    name: ClassVar[str] = "sensor-logger"
+    title: ClassVar[str] = "Sensor Logger: zip or folder of CSV, JSON, SQLite; Android and iOS"
+    Options = SensorLoggerOptions
+
+    def sniff(self, head: bytes, path: Path) -> float:
+        """Its columns, keys or tables."""
+        if path.is_dir():
+            return max((0.92 for p in _files(path) if find_header(start_of(p), _is_header)), default=0.0)
+        if head.startswith(b"SQLite format 3\x00"):
+            return 0.9 if b"seconds_elapsed" in head else 0.0
+        if head.lstrip().startswith(b"["):
+            return 0.9 if b'"seconds_elapsed"' in head and b'"sensor"' in head else 0.0
+        return 0.9 if find_header(head, _is_header) else 0.0
+
+    def read(self, paths: Sequence[Path], options: SensorLoggerOptions) -> Import:
+        """Read a folder or a file."""
+        path = paths[0]
+        report = ReportBuilder()
+        attachments: list[SourceAttachment] = []
+        tables, about = _tables(path, report)
+        platform = options.platform or about.get("platform", "").lower()
+        said = about.get("standardisation", "").lower()
+        standard = options.standardised if options.standardised is not None else said in ("true", "1", "yes")
+        if platform not in ("android", "ios"):
+            report.note(
+                "assumed_platform",
+                "no metadata say whether this is Android or iOS, whose signs differ: Android is taken; "
+                "set platform=ios",
+            )
+            platform = "android"
+        turned = platform == "ios" and not standard
+        streams = list(_streams(path, tables, turned, report, attachments))
+        return Import(
+            channels=declared(s for s, _ in streams),
+            blocks=_blocks(path, streams),
+            report=report,
+            attachments=attachments,
+            metadata={
+                "device": {
+                    "clock": "utc",
+                    "time": "nanoseconds since 1970",
+                    "name": "Sensor Logger",
+                    "platform": platform,
+                    "frames": AXES,
+                    "converted": ("sign of acceleration and gravity turned (iOS); " if turned else "")
+                    + "gravity added to the accelerometer where the app took it out; field from µT, pressure from hPa",
+                    **{
+                        k: about[v]
+                        for k, v in (("phone", "device name"), ("app_version", "appVersion"))
+                        if v in about
+                    },
+                }
+            },
+        )
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(p for p in (*folder.glob("*.csv"), *folder.glob("*/*.csv")) if p.is_file())
+
+
+def _is_header(cells: Sequence[str]) -> bool:
+    return "time" in cells and "seconds_elapsed" in cells
+
+
+def _tables(path: Path, report: ReportBuilder) -> tuple[dict[str, pl.DataFrame], dict[str, str]]:
+    """Return what is read: a table a sensor (``t`` ns, ``line``, numbers), and the metadata."""
+    if path.is_dir():
+        files, about = _files(path), {}
+        for file in files:
+            if file.stem.lower() == "metadata":
+                about = _first_row(file)
+        found = {f.stem: _csv(f, report) for f in files if f.stem in READ}
+        return {k: v for k, v in found.items() if v is not None}, about
+    head = start_of(path)
+    if head.startswith(b"SQLite format 3\x00"):
+        return _sqlite(path)
+    if head.lstrip().startswith(b"["):
+        return _json(path)
+    table = _csv(path, report)
+    name = path.stem if path.stem in READ else ""
+    if not name:
+        raise MarchaError(f"{path}: its name says no sensor; one of {', '.join(READ)}.csv")
+    return ({name: table} if table is not None else {}), {}
+
+
+def _first_row(file: Path) -> dict[str, str]:
+    try:
+        rows = pl.read_csv(file, infer_schema=False, n_rows=1)
+    except (OSError, pl.exceptions.PolarsError) as error:
+        raise MarchaError(f"{file}: cannot be read: {str(error).splitlines()[0]}") from None
+    return {k: v for k, v in rows.row(0, named=True).items() if v} if rows.height else {}
+
+
+def _csv(file: Path, report: ReportBuilder) -> pl.DataFrame | None:
+    header = require_header(file, _is_header, WANTED)
+    try:
+        blocks = list(float_blocks(file, header, "time", report, integers=("time",), texts=_TEXT))
+    except MarchaError as error:
+        if "ends before its first row" not in str(error):
+            raise
+        blocks = []
+    if not blocks:
+        report.note("header_only", f"{file.name}: has a header and no row: no channel", subject=file.name)
+        return None
+    return pl.concat(blocks).rename({"time": "t"})
+
+
+def _numbers(rows: pl.DataFrame) -> pl.DataFrame:
+    """Return a table of text as numbers; ``time`` whole."""
+    t = rows["time"].cast(pl.String).cast(pl.Int64, strict=False)
+    others = [c for c in rows.columns if c not in ("time", *_TEXT)]
+    table = rows.select(
+        pl.col(c).cast(pl.String).cast(pl.Float64, strict=False).fill_null(np.nan) for c in others
+    )
+    line = pl.Series("line", np.arange(1, rows.height + 1))
+    return table.with_columns(t=t, line=line).drop_nulls("t")
+
+
+def _json(path: Path) -> tuple[dict[str, pl.DataFrame], dict[str, str]]:
+    try:
+        rows = msgspec.json.decode(path.read_bytes(), type=list[dict[str, Any]])
+    except (OSError, msgspec.MsgspecError) as error:
+        raise MarchaError(f"{path}: not a whole JSON of Sensor Logger: {error}") from None
+    by_sensor: dict[str, list[dict[str, Any]]] = {}
+    for row in rows:
+        by_sensor.setdefault(str(row.get("sensor", "")), []).append(row)
+    about = {k: str(v) for k, v in (by_sensor.get("Metadata") or [{}])[0].items()}
+    tables = {k: pl.DataFrame(v, infer_schema_length=None) for k, v in by_sensor.items() if k in READ}
+    return {k: _numbers(v) for k, v in tables.items() if "time" in v.columns}, about
+
+
+def _sqlite(path: Path) -> tuple[dict[str, pl.DataFrame], dict[str, str]]:
+    tables: dict[str, pl.DataFrame] = {}
+    about: dict[str, str] = {}
+    try:
+        with contextlib.closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as base:
+            names = [r[0] for r in base.execute("select name from sqlite_master where type = 'table'")]
+            for name in names:
+                if name not in READ and name.lower() != "metadata":
+                    continue
+                cursor = base.execute(f'select * from "{name}"')  # a name of READ: no foreign text
+                columns = [c[0] for c in cursor.description]
+                rows = [[None if v is None else str(v) for v in row] for row in cursor]
+                if name.lower() == "metadata":
+                    about = {c: v for c, v in zip(columns, rows[0], strict=True) if v} if rows else {}
+                elif rows and "time" in columns:
+                    data = dict(zip(columns, map(list, zip(*rows, strict=True)), strict=True))
+                    tables[name] = _numbers(pl.DataFrame(data, schema=dict.fromkeys(columns, pl.String)))
+    except sqlite3.Error as error:
+        raise MarchaError(f"{path}: the database cannot be read: {error}") from None
+    return tables, about
+
+
+def _streams(
+    path: Path,
+    tables: dict[str, pl.DataFrame],
+    turned: bool,
+    report: ReportBuilder,
+    attachments: list[SourceAttachment],
+) -> Iterator[tuple[Stream, pl.DataFrame]]:
+    axes = ("x", "y", "z")
+    sign = -1.0 if turned else 1.0
+    acc = _acceleration(tables, turned, report)
+    if acc is not None:
+        how, frame = acc
+        yield (
+            Stream([imu_part("/phone/acc", xyz(ACC, axes), gravity=how)], report, subject="acceleration"),
+            frame,
+        )
+    elif "Accelerometer" in tables:
+        report.loss(
+            "gravity_free",
+            "Accelerometer has no gravity and neither Gravity nor TotalAcceleration was recorded: no attitude from it",
+        )
+        part = Part("/phone/linear_acc", VALUES, xyz(ACC, axes, sign), ACC, metadata={"gravity": "removed"})
+        yield Stream([part], report, subject="Accelerometer"), tables["Accelerometer"]
+    for topic, names in (("/phone/gyr", "Gyroscope"), ("/phone/mag", "Magnetometer")):
+        name = next((n for n in (names, f"{names}Uncalibrated") if n in tables), None)
+        if name is not None and all(a in tables[name].columns for a in axes):
+            part = (
+                imu_part(topic, xyz(GYR, axes), source=name)
+                if names == "Gyroscope"
+                else Part(topic, MAG, xyz(FIELD, axes, MICROTESLA), metadata={"source": name})
+            )
+            yield Stream([part], report, subject=name), tables[name]
+    name = next((n for n in ("LocationGps", "Location") if n in tables), None)
+    if name is not None:
+        known = {
+            "lat": "latitude", "lon": "longitude", "alt": "altitude",
+            "accuracy": "horizontalAccuracy", "vertical": "verticalAccuracy",
+        }  # fmt: skip
+        columns = {k: v for k, v in known.items() if v in tables[name].columns}
+        if "lat" in columns and "lon" in columns:
+            fixes = Stream([fix_part(columns)], report, subject=name, even=False, attachments=attachments)
+            yield fixes, tables[name]
+    if "Barometer" in tables and "pressure" in tables["Barometer"].columns:
+        part = Part("/phone/pressure", PRESSURE, {"pressure_pa": Source("pressure", HECTOPASCAL)})
+        yield Stream([part], report, subject="Barometer", even=False), tables["Barometer"]
+    if "Pedometer" in tables and "steps" in tables["Pedometer"].columns:
+        part = Part("/phone/steps", VALUES, {"steps": Source("steps", 1.0)}, ("steps",))
+        yield Stream([part], report, subject="Pedometer", even=False), tables["Pedometer"]
+
+
+def _acceleration(
+    tables: dict[str, pl.DataFrame], turned: bool, report: ReportBuilder
+) -> tuple[str, pl.DataFrame] | None:
+    """Return the acceleration with gravity in Android's sign, and how it came about."""
+    sign = -1.0 if turned else 1.0
+    if "TotalAcceleration" in tables:
+        return "included", _scaled(tables["TotalAcceleration"], sign)
+    if "Accelerometer" in tables and "Gravity" in tables and tables["Gravity"].height:
+        acc, gravity = tables["Accelerometer"], tables["Gravity"].sort("t")
+        summed = acc.select("t", "line").with_columns(
+            pl.Series(
+                a,
+                acc[a].to_numpy()
+                + np.interp(acc["t"].to_numpy(), gravity["t"].to_numpy(), gravity[a].to_numpy()),
+            )
+            for a in "xyz"
+        )
+        report.keep(gravity.height)  # its rows are in the sums
+        return "Accelerometer + Gravity at the accelerometer's times", _scaled(summed, sign)
+    if "AccelerometerUncalibrated" in tables:
+        factor = -STANDARD_GRAVITY if turned else 1.0
+        return "included (uncalibrated)", _scaled(tables["AccelerometerUncalibrated"], factor)
+    return None
+
+
+def _scaled(table: pl.DataFrame, factor: float) -> pl.DataFrame:
+    return table.with_columns(pl.col(a) * factor for a in "xyz")
+
+
+def _blocks(path: Path, streams: list[tuple[Stream, pl.DataFrame]]) -> Iterator[tuple[str, pl.DataFrame]]:
+    for stream, frame in streams:
+        yield from stream.pull([frame])
+    require_rows(path, [s for s, _ in streams])

@@ -1,0 +1,230 @@
+"""Importers of the source's text, Sensor Logger, GetSensorData, GnssLogger, GPX, KML; archives of strangers."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sqlite3
+import stat
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from marcha.ingest import convert, recognise
+from marcha.ingest.archive import unpack
+from marcha.ingest.formats.android_text import AndroidText
+from marcha.ingest.formats.getsensordata import GetSensorData
+from marcha.ingest.formats.gnsslogger import GnssLogger
+from marcha.ingest.formats.sensor_logger import SensorLogger
+from marcha.ingest.formats.tracks import Gpx, Kml
+from marcha.ingest.simulate import PhoneWalk
+from marcha.recording import MarchaError
+
+from . import phone_samples as samples
+from .test_import_phone import ACC, GYR, MAG, PhoneContract, kinds, read, same
+
+
+@pytest.fixture(scope="module")
+def walk() -> PhoneWalk:
+    return samples.short_walk()
+
+
+class TestAndroidText(PhoneContract):
+    importer = AndroidText()
+
+    def sample(self, folder: Path) -> Path:
+        return samples.android_text(folder / "log.txt", self.walk)
+
+
+class TestGetSensorData(PhoneContract):
+    importer = GetSensorData()
+
+    def sample(self, folder: Path) -> Path:
+        return samples.getsensordata(folder / "log.txt", self.walk)
+
+
+class TestGnssLogger(PhoneContract):
+    importer = GnssLogger()
+
+    def sample(self, folder: Path) -> Path:
+        return samples.gnsslogger(folder / "log.txt", self.walk)
+
+
+class TestGpx(PhoneContract):
+    importer = Gpx()
+
+    def sample(self, folder: Path) -> Path:
+        return samples.gpx(folder / "walk.gpx", self.walk)
+
+
+class TestKml(PhoneContract):
+    importer = Kml()
+
+    def sample(self, folder: Path) -> Path:
+        return samples.kml(folder / "walk.kml", self.walk)
+
+
+class TestSensorLogger(PhoneContract):
+    importer = SensorLogger()
+
+    def sample(self, folder: Path) -> Path:
+        return samples.sensor_logger(folder / "log", self.walk)
+
+
+def test_android_text_gives_fixes_once(tmp_path: Path, walk: PhoneWalk) -> None:
+    imported, tables, report = read(AndroidText(), samples.android_text(tmp_path / "a.txt", walk))
+    assert tables["/phone/gnss"].height == walk.fixes.height
+    last = len(tables["/phone/acc"])
+    assert same(tables["/phone/acc"], ACC, walk.acc_b[-last:])
+    assert same(tables["/phone/mag"], MAG, walk.mag_b[-last:])
+    assert kinds(report)["stale_repeat"] == last - walk.fixes.height
+    assert imported.metadata["device"]["header SamplingTime"] == "50ms"
+
+
+def test_android_text_packed_fixes_are_no_track(tmp_path: Path) -> None:
+    row = "{},-0.39,3.73,8.64,-16.7,-17.3,-15.6,{:.7f},-47.07604455#"
+    lines = [row.format(1489060307326 + 53 * k, -22.8264 - (1e-4 * min(k, 4))) for k in range(60)]
+    (tmp_path / "a.txt").write_text("@Date: x\n" + "\n".join(lines))
+    imported, tables, report = read(AndroidText(), tmp_path / "a.txt")
+    assert kinds(report)["packed_fixes"] == 5
+    assert "/phone/gnss" not in tables
+    assert imported.attachments[0].data.count(b"\n") == 6
+
+
+@pytest.mark.parametrize(("platform", "standard"), [("android", False), ("ios", False), ("ios", True)])
+def test_sensor_logger_has_one_sign_and_gravity(
+    tmp_path: Path, walk: PhoneWalk, platform: str, standard: bool
+) -> None:
+    folder = samples.sensor_logger(tmp_path / "log", walk, platform, standard)
+    imported, tables, _ = read(SensorLogger(), folder)
+    assert same(tables["/phone/acc"], ACC, walk.acc_b, 1e-5)
+    assert same(tables["/phone/gyr"], GYR, walk.gyr_b)
+    assert same(tables["/phone/mag"], MAG, walk.mag_b)
+    assert np.array_equal(tables["/phone/acc"]["t_ns"].to_numpy(), walk.t_ns)
+    assert same(tables["/phone/gnss"], ["sd_east_m"], walk.fixes.select("sd_east_m").to_numpy(), 1e-5)
+    assert imported.metadata["device"]["platform"] == platform
+
+
+@pytest.mark.parametrize("kind", ["json", "sqlite", "zip"])
+def test_sensor_logger_in_one_file_is_the_same(tmp_path: Path, walk: PhoneWalk, kind: str) -> None:
+    folder = samples.sensor_logger(tmp_path / "log", walk, "ios")
+    tables = {f.stem: list(csv.DictReader(f.open())) for f in folder.glob("*.csv")}
+    path = tmp_path / f"log.{kind}"
+    if kind == "json":
+        path.write_text(json.dumps([{"sensor": n} | r for n, rows in tables.items() for r in rows]))
+    elif kind == "sqlite":
+        with sqlite3.connect(path) as base:
+            for name, rows in tables.items():
+                base.execute(f'create table "{name}" ({",".join(f"[{c}] text" for c in rows[0])})')
+                marks = ",".join("?" * len(rows[0]))
+                base.executemany(f'insert into "{name}" values ({marks})', [list(r.values()) for r in rows])
+        base.close()
+    else:
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+            for f in folder.glob("*.csv"):
+                archive.write(f, f.name)
+    whole, single = convert(folder, tmp_path / "a.mcap"), convert(path, tmp_path / "b.mcap")
+    assert whole.format == single.format == "sensor-logger"
+    assert whole.channels == single.channels
+
+
+def test_sensor_logger_without_gravity_says_so(tmp_path: Path, walk: PhoneWalk) -> None:
+    folder = samples.sensor_logger(tmp_path / "log", walk)
+    (folder / "Gravity.csv").unlink()
+    _, tables, report = read(SensorLogger(), folder)
+    assert "/phone/acc" not in tables
+    assert "/phone/linear_acc" in tables
+    assert kinds(report)["gravity_free"] == 1
+
+
+def test_getsensordata_takes_the_sensors_clock(tmp_path: Path, walk: PhoneWalk) -> None:
+    _, tables, _ = read(GetSensorData(), samples.getsensordata(tmp_path / "g.txt", walk))
+    assert same(tables["/phone/gyr"], GYR, walk.gyr_b)
+    intervals = np.diff(tables["/phone/acc"]["t_ns"].to_numpy()) - np.diff(walk.t_ns)
+    assert np.abs(intervals).max() <= 2000  # not the 4 ms of the app
+    assert tables["/phone/radio"]["mac"][0] == "16:74:9c:2b:4d:1b"
+    assert tables["/reference/fix"].height == 1
+
+
+def test_gnsslogger_takes_the_bias_off(tmp_path: Path, walk: PhoneWalk) -> None:
+    _, tables, _ = read(GnssLogger(), samples.gnsslogger(tmp_path / "g.txt", walk))
+    assert same(tables["/phone/acc"], ACC, walk.acc_b, 1e-5)
+    assert np.allclose(tables["/phone/mag"].select(MAG).to_numpy(), walk.mag_b, atol=1e-10)
+    assert tables["/phone/gnss"].height == walk.fixes.height
+
+
+def test_a_line_without_times_is_no_recording(tmp_path: Path) -> None:
+    line = "<LineString><coordinates>1,2,3 1.1,2,3</coordinates></LineString>"
+    (tmp_path / "l.kml").write_text(f"<kml><Placemark>{line}</Placemark></kml>")
+    with pytest.raises(MarchaError, match="no time"):
+        read(Kml(), tmp_path / "l.kml")
+
+
+def test_reference_track(tmp_path: Path, walk: PhoneWalk) -> None:
+    _, tables, _ = read(Gpx(), samples.gpx(tmp_path / "r.gpx", walk), role="reference")
+    assert set(tables) == {"/reference/fix"}
+
+
+def made(path: Path, *members: tuple[zipfile.ZipInfo | str, bytes]) -> Path:
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in members:
+            archive.writestr(name, data)
+    return path
+
+
+def link() -> zipfile.ZipInfo:
+    info = zipfile.ZipInfo("link.csv")
+    info.external_attr = (stat.S_IFLNK | 0o777) << 16
+    return info
+
+
+@pytest.mark.parametrize(
+    ("members", "said"),
+    [
+        ([("../out.csv", b"x")], "leads out"),
+        ([("/etc/out.csv", b"x")], "leads out"),
+        ([("a\\..\\..\\b.csv", b"x")], "leads out"),
+        ([(link(), b"/etc/passwd")], "is a link"),
+        ([("a.csv", b"x"), ("A.csv", b"y")], "stands twice"),
+        ([("n" * 250 + ".csv", b"x")], "too long"),
+        ([("big.csv", b"0" * 3_000_000)], "unpacks to"),
+    ],
+)
+def test_archives_that_could_do_harm_are_refused(tmp_path: Path, members: list, said: str) -> None:
+    path = made(tmp_path / "z.zip", *members)
+    folder = tmp_path / "out"
+    folder.mkdir()
+    with pytest.raises(MarchaError, match=said) as caught:
+        unpack(path, folder, 0.002)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out.csv").exists()
+
+
+@pytest.mark.data
+def test_every_real_phone_log_has_one_format(data_dir: Path) -> None:
+    found = {}
+    for name in ("phone", "indoor/android_paths"):
+        for path in sorted((data_dir / name).rglob("*")):
+            if len(candidates := recognise(path)) >= 1:
+                assert len(candidates) == 1 or candidates[0].confidence - candidates[1].confidence >= 0.1, (
+                    path
+                )
+                found[path.relative_to(data_dir).as_posix()] = candidates[0].name
+    assert found["phone/phyphox"] == found["phone/broken/phyphox_semicolon"] == "phyphox"
+    assert found["phone/androsensor/Coordinates.pos"] == "rtk-pos"
+    assert found["phone/steps/Nexus_Jamie_Hard_InHand_2"] == "android-ns"
+    assert found["indoor/android_paths/5dd9efa99191710006b57090.txt"] == "indoor-location"
+
+
+@pytest.mark.data
+def test_real_findings(data_dir: Path, tmp_path: Path) -> None:
+    done = convert(data_dir / "phone" / "sensortester", tmp_path / "s.mcap")
+    assert {f.kind for f in done.report.findings} >= {"backwards_time", "duplicate_row", "unit_doubt"}
+    for name, steps in (("Nexus_Jamie_Hard_InHand_2", 306), ("Samsung_Dario_Hard_InHand_1", 277)):
+        done = convert(data_dir / "phone" / "steps" / name, tmp_path / f"{name}.mcap")
+        assert {c.topic: c.count for c in done.channels}["/reference/steps"] == steps
+    done = convert(data_dir / "phone" / "broken" / "phyphox_semicolon", tmp_path / "b.mcap")
+    assert "outside_recording" in {f.kind for f in done.report.findings}
+    with pytest.raises(MarchaError, match="spreadsheet"):
+        convert(data_dir / "phone" / "broken" / "excel_rounded", tmp_path / "e.mcap")
