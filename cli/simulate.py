@@ -35,7 +35,7 @@ def simulate(
     Parameters
     ----------
     scenario : str
-        rectangle, straight, figure-eight, stairs or still.
+        rectangle, straight, figure-eight, stairs or still; of legs: walking, sit-to-stand or squats.
     output : Path
         Folder for the raw logs and the truth beside them.
     option : str
@@ -68,5 +68,6 @@ def simulate(
     }
     lines = [Heading(f"wrote {path}") for path in (*made.paths, *made.truth)]
     closed = "closed" if made.closed else "open"
-    lines.append(Heading(f"{made.rows} rows, {closed} walk of {made.length_m:.2f} m"))
+    walk = f", {closed} walk of {made.length_m:.2f} m" if made.length_m else ""
+    lines.append(Heading(f"{made.rows} rows{walk}"))
     return Outcome(document, lines)

@@ -108,7 +108,7 @@ class _Sensor:
         if count < 3:
             return 0.0
         mean = acc[: count * rows].reshape(count, rows, 3).mean(axis=1)
-        mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+        mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
         # The widest angle between a mean direction and the one that is farthest from the middle.
         middle = mean.mean(axis=0)
         far = mean[np.argmin(mean @ middle)]

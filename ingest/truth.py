@@ -3,6 +3,8 @@
 ``<stem>.truth.csv`` has ``t_ns`` on the device's unrolled clock, pose and velocity of sensor 1 and whether
 the foot is still; it becomes ``/reference/pose``, ``/reference/velocity`` and ``/reference/stance``.
 ``<stem>.truth.imu2.csv`` has the same of sensor 2, for ``/reference/imu2/pose`` and so on.
+``<stem>.truth.leg.csv`` has ``t_ns``, columns ``joint.<name>`` (rad) and ``<segment>.quat_w`` …, for
+``/reference/joint`` and ``/reference/<segment>/orientation``.
 ``<stem>.truth.toml`` holds facts (closed, length_m, scenario, seed …) for the metadata record ``truth``.
 """
 
@@ -72,11 +74,36 @@ def read_truth(path: Path) -> Truth | None:
                 (ChannelSpec(f"/reference/{part}{what}", schema, "nav"), table.select("t_ns", *columns))
                 for what, schema, columns in SCHEMAS
             ]
-    if facts_file.is_file():
+    if (file := path.with_name(f"{path.stem}.truth.leg.csv")).is_file() and path.suffix != ".trc":
+        files.append(file)
+        tables += _leg(file)
+    if facts_file.is_file() and path.suffix != ".trc":  # a capture's truth comes with its inertial log
         files.append(facts_file)
     if not files:
         return None
     return Truth(tuple(files), _facts(facts_file) if facts_file in files else {}, tables)
+
+
+def _leg(file: Path) -> Iterator[tuple[ChannelSpec, pl.DataFrame]]:
+    try:
+        table = pl.read_csv(file, infer_schema_length=None)
+        joints = [c for c in table.columns if c.startswith("joint.")]
+        angles = table.select(
+            pl.col("t_ns").cast(pl.Int64), *(pl.col(c).alias(c[6:]).cast(pl.Float64) for c in joints)
+        )
+        found = [
+            (
+                ChannelSpec("/reference/joint", "sensor_msgs/msg/JointState", "", tuple(angles.columns[1:])),
+                angles,
+            )
+        ]
+        for name in dict.fromkeys(c.partition(".quat_")[0] for c in table.columns if ".quat_" in c):
+            turned = table.select("t_ns", *(pl.col(f"{name}.quat_{a}").alias(f"quat_{a}") for a in "wxyz"))
+            spec = ChannelSpec(f"/reference/{name}/orientation", "geometry_msgs/msg/QuaternionStamped", "nav")
+            found.append((spec, turned))
+    except (OSError, pl.exceptions.PolarsError) as error:
+        raise MarchaError(f"{file}: not a readable truth table: {str(error).splitlines()[0]}") from error
+    yield from found
 
 
 def as_text(value: object) -> str:

@@ -108,9 +108,9 @@ def test_encoder_errors_are_those_that_are_asked_for() -> None:
 
 
 def test_the_cameras_have_their_own_clock_and_lose_markers() -> None:
-    options = {"optical_offset_s": 12.5, "optical_drift_ppm": 40, "optical_start_s": 1, "optical_stop_s": 9}
+    options = {"optical_offset_s": -12.5, "optical_drift_ppm": 40, "optical_start_s": 1, "optical_stop_s": 9}
     o = leg("walking", seed=4, duration_s=10, dropout_share=0.05, **options).optical
-    assert o.t_ns / 1e9 == pytest.approx((o.t - 12.5) * (1 + 40e-6), abs=1e-9)
+    assert o.t_ns / 1e9 == pytest.approx((o.t + 12.5) * (1 + 40e-6), abs=1e-9)
     assert 1 <= o.t[0] < 1.02
     assert 8.98 < o.t[-1] <= 9
     hidden = np.isnan(o.pos[..., 0])

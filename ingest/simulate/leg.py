@@ -105,7 +105,7 @@ class LegOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
         Rate of the cameras and noise of a marker's coordinate (m).
     optical_offset_s, optical_drift_ppm : float
         The cameras' clock reads ``(t - optical_offset_s) (1 + optical_drift_ppm 1e-6)`` at time t of the
-        inertial clock.
+        inertial clock; it starts at zero.
     optical_start_s, optical_stop_s : float or None
         When the cameras run, on the inertial clock.
     dropout_share, dropout_s : float

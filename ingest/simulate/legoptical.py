@@ -57,8 +57,8 @@ def capture(leg: LegCapture) -> Optical:
     o, rng = leg.options, leg._rng("optical")
     stop = min(o.duration_s, o.optical_stop_s or o.duration_s)
     # The cameras count their own time: their frames are even on their clock, not on the other.
-    first = np.ceil((o.optical_start_s - o.optical_offset_s) * o.optical_rate_hz - 1e-9)
     speed = 1 + o.optical_drift_ppm * 1e-6
+    first = max(0.0, np.ceil((o.optical_start_s - o.optical_offset_s) * speed * o.optical_rate_hz - 1e-9))
     last = np.floor((stop - o.optical_offset_s) * speed * o.optical_rate_hz + 1e-9)
     own = np.arange(first, last + 1) / o.optical_rate_hz
     t = own / speed + o.optical_offset_s

@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 from ...recording.errors import MarchaError, OutputExists, UsageError
 from .gait import Motion
+from .leg import SCENARIOS as LEGS
+from .leg import leg
+from .legfiles import files
 from .walks import Simulation, checked, make_options
 
 CHATTER = (
@@ -137,6 +140,8 @@ def simulate(
     OutputExists
         A file is there already.
     """
+    if scenario in LEGS:
+        return _leg(scenario, Path(out_dir), seed, name, format, overwrite, options)
     if format not in ("text", "packets"):
         raise UsageError(f"simulate: format {format!r} is unknown: choose text or packets")
     line_given = {k: options.pop(k) for k in Line.__struct_fields__ if k in options}
@@ -158,6 +163,33 @@ def simulate(
             f"{error.filename or folder}: cannot write: {error.strerror or error}; nothing was written"
         ) from error
     return Simulated([log], truths, rows, simulation.route.closed, simulation.length_m)
+
+
+def _leg(
+    scenario: str,
+    folder: Path,
+    seed: int,
+    name: str | None,
+    format: str,
+    overwrite: bool,
+    options: dict[str, Any],
+) -> Simulated:
+    """Write a capture of legs: the exoskeleton's CSV with its mapping, the cameras' TRC, the truth."""
+    if format != "text":
+        raise UsageError(f"simulate {scenario}: captures of legs are text; leave out format={format}")
+    capture = leg(scenario, seed=seed, **options)
+    raw, truth = files(capture, folder, name or f"{scenario}-{seed:03d}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with _outputs([*raw, *truth], overwrite) as handles:
+            for handle, content in zip(handles, (*raw.values(), *truth.values()), strict=True):
+                handle.write(content)
+    except OSError as error:
+        raise MarchaError(
+            f"{error.filename or folder}: cannot write: {error.strerror or error}; nothing was written"
+        ) from error
+    logs = [p for p in raw if p.suffix != ".toml"]  # the mapping is found beside the CSV
+    return Simulated(logs, [*truth, *(p for p in raw if p.suffix == ".toml")], len(capture.t), False, 0.0)
 
 
 def _write(
