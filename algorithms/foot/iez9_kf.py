@@ -76,10 +76,11 @@ class Foot9IezKfParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=T
     zupt_turns: Annotated[
         bool,
         meta(
-            "Let the zero-velocity update correct this orientation too; the source leaves it to its own "
-            "filter"
+            "Let the zero-velocity update correct this orientation too; the published figures need it: they "
+            "follow 9IEZ in all four configurations",
+            source="dissertation, tables 5 to 7",
         ),
-    ] = False
+    ] = True
 
 
 Foot9IezKfAllParams = with_parts(Foot9IezKfParams, "Foot9IezKfAllParams", __name__)
@@ -191,7 +192,8 @@ class Foot9IezKf(FootEstimator):
     Departures: the states are the small errors about the level axes and the three biases, not roll, pitch
     and yaw: the same filter to first order, without the singularity at pitch ±90° that a shoe comes near.
     The accelerometer levels in stance only, where it measures gravity, and the zero angular rate has its own
-    stricter rest. The orientation is considered in the position filter, as in ``foot.9iez-mad``.
+    stricter rest. Without ``zupt_turns`` the orientation is considered in the position filter, as in
+    ``foot.9iez-mad``.
     """
 
     name: ClassVar[str] = "foot.9iez-kf"
