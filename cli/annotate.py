@@ -210,7 +210,7 @@ def import_(
     *,
     tier: Tier = None,
     format: Annotated[str | None, Parameter(name="--format")] = None,
-    offset: Annotated[float, Parameter(name="--offset")] = 0.0,
+    offset: Annotated[float, Parameter(name="--offset", allow_leading_hyphen=True)] = 0.0,
     replace: Annotated[bool, Parameter(name="--replace", negative="")] = False,
     source: str | None = None,
     where: Where = WHERE,

@@ -59,6 +59,14 @@ COMMANDS: tuple[tuple[Group, str, str, str], ...] = (
         "Add, change, import, export, list or compare annotations of a recording.",
     ),
     (HAND, "export", "export:export", "Write a recording, or part of it, in another tool's format."),
+    (HAND, "cut", "parts:cut", "Write a part of a recording: a range of time, or what an annotation marks."),
+    (HAND, "merge", "parts:merge", "Join recordings into one, each with its offset in time."),
+    (
+        HAND,
+        "anonymize",
+        "parts:anonymize",
+        "Take names, serials, dates and fixes out of a recording, and list what is left.",
+    ),
     (HAND, "demo", "demo:demo", "Simulate, convert, replay, evaluate and export three walks."),
     (
         MORE,

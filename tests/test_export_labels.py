@@ -8,7 +8,6 @@ from xml.etree import ElementTree
 
 import marcha.recording as mr
 import polars as pl
-import pympi
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,6 +17,8 @@ from marcha.export.labels.side import lanes, side_path
 from marcha.recording import MarchaError, Recording
 from marcha.recording.annotations import COLUMNS
 from marcha.recording.changes import change
+from pympi.Elan import Eaf
+from pympi.Praat import TextGrid
 
 from .annotation_samples import START_NS, annotations, recording
 
@@ -74,7 +75,7 @@ def test_without_the_side_file_times_and_texts_are_right(
 def test_elan_files_have_no_overlap_in_a_tier_and_other_readers_agree(
     rec: Recording, files: dict[str, Path]
 ) -> None:
-    eaf = pympi.Elan.Eaf(str(files["eaf"]))
+    eaf = Eaf(str(files["eaf"]))
     read = 0
     for tier in eaf.get_tier_names():
         rows = sorted(row[:2] for row in eaf.get_annotation_data_for_tier(tier))
@@ -87,7 +88,7 @@ def test_elan_files_have_no_overlap_in_a_tier_and_other_readers_agree(
 def test_praat_files_have_no_gap_in_a_tier_and_other_readers_agree(
     files: dict[str, Path], rec: Recording
 ) -> None:
-    grid = pympi.Praat.TextGrid(str(files["textgrid"]))
+    grid = TextGrid(str(files["textgrid"]))
     points = sum(len(list(t.get_intervals(sort=True))) for t in grid.get_tiers() if t.tier_type == "TextTier")
     assert points == (rec.annotations["start_ns"] == rec.annotations["end_ns"]).sum()
     for tier in grid.get_tiers():
@@ -155,7 +156,7 @@ def test_elan_s_own_files_with_open_slots_and_referring_tiers(
 
 
 def test_elan_opens_what_pympi_saves_again(rec: Recording, files: dict[str, Path], tmp_path: Path) -> None:
-    eaf = pympi.Elan.Eaf(str(files["eaf"]))
+    eaf = Eaf(str(files["eaf"]))
     eaf.to_file(str(tmp_path / "again.eaf"))
     assert read_labels(tmp_path / "again.eaf", rec).annotations.height == COUNT
 

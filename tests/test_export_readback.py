@@ -8,7 +8,7 @@ import os
 import shutil
 import subprocess
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from xml.etree import ElementTree
 
 import ezc3d
@@ -183,7 +183,7 @@ def test_ros2_bag_by_rosbags(rec: Recording, tmp_path: Path) -> None:
     with Reader(tmp_path / "bag") as bag:
         assert bag.topics["/foot/imu1"].msgcount == ROWS
         read = [
-            store.deserialize_cdr(raw, connection.msgtype).linear_acceleration.x
+            cast(Any, store.deserialize_cdr(raw, connection.msgtype)).linear_acceleration.x
             for connection, _, raw in bag.messages([c for c in bag.connections if c.topic == "/foot/imu1"])
         ]
     assert read == rec.table("/foot/imu1")["acc_x"].to_list()

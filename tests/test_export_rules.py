@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import marcha.recording as mr
@@ -18,7 +19,9 @@ S = 10**9
 RATE_NS = 10**7
 
 
-def walk(path: Path, headings_deg: list[float], heights_m: list[float], jump: bool = False) -> Recording:
+def walk(
+    path: Path, headings_deg: Sequence[float], heights_m: Sequence[float], jump: bool = False
+) -> Recording:
     """Write a walk of one stride a second: 0.6 s of stance, 0.4 s of swing."""
     count = len(headings_deg)
     t = np.arange(0, (count + 1) * S, RATE_NS)
