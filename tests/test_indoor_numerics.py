@@ -119,7 +119,9 @@ def test_the_covariance_is_the_bound():
     truth = np.array([12.0, 4.0])
     fix = lat.least_squares(FLOOR, np.linalg.norm(FLOOR - truth, axis=1), 0.2)
     assert fix is not None
-    assert np.sqrt(np.trace(fix.covariance)) == pytest.approx(lat.cramer_rao_m(truth, FLOOR, 0.2)[0], rel=1e-6)
+    assert np.sqrt(np.trace(fix.covariance)) == pytest.approx(
+        lat.cramer_rao_m(truth, FLOOR, 0.2)[0], rel=1e-6
+    )
 
 
 def test_dilution_of_known_geometry():

@@ -156,6 +156,8 @@ def least_squares(
         Height of each anchor above the receiver, m.
     margin_m : float
         How far outside of the anchors' rectangle a position is believed.
+    steps : int
+        Most iterations.
     """
     a, d = np.asarray(anchors, dtype=np.float64), np.maximum(np.asarray(ranges, dtype=np.float64), NEAREST_M)
     sigma = np.broadcast_to(np.asarray(relative_sigma, dtype=np.float64), d.shape)
@@ -192,7 +194,7 @@ def least_squares(
         return None
     freedom = d.size - 2
     chi2 = best / freedom if freedom > 0 else math.nan
-    return Fix(p, np.linalg.inv(normal), chi2)
+    return Fix(p, np.asarray(np.linalg.inv(normal), dtype=np.float64), chi2)
 
 
 def information(
