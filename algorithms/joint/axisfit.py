@@ -472,9 +472,10 @@ def fit_position(w: Any, rows: FloatArray, count: int, sd: float) -> None:
     total = 0.0
     for i in range(2):
         for m in range(3):
-            across = 1.0 - w.axis[i, m] * w.axis[i, m]
-            total += scale * w.cov[3 * i + m, 3 * i + m] * across
-    w.pos_sd = math.sqrt(0.5 * total)
+            total += scale * w.cov[3 * i + m, 3 * i + m]
+            for k in range(3):
+                total -= scale * w.axis[i, m] * w.cov[3 * i + m, 3 * i + k] * w.axis[i, k]
+    w.pos_sd = math.sqrt(max(0.0, 0.5 * total))
     along = 0.0
     for i in range(2):
         for m in range(3):
