@@ -152,8 +152,8 @@ class JointCalibrator(Calibrator):
             why = f"both turn as one body ({w['turn_rms']:.2f} rad/s between them, at least 0.1)"
         elif sd.max() > p.max_sd_deg:
             why = f"standard deviation {sd.max():.1f}° above {p.max_sd_deg:g}°: more motion about other directions"
-        elif not paired or w["pairing"] <= 0.6:
-            why = f"the axes' signs cannot be paired ({w['pairing']:.2f} of at least 0.6): axis near the vertical?"
+        elif not paired or w["pairing"] <= 0.55:
+            why = f"the axes' signs cannot be paired ({w['pairing']:.2f} of at least 0.55): axis near the vertical?"
         cov = {}
         for i, segment in enumerate((upper, lower)):
             b = w["tangent"][i]

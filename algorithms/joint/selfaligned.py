@@ -109,7 +109,7 @@ def identify(s: Any, lag: int) -> None:
 def observable(s: Any) -> bool:
     """Return whether the identified axes may be used."""
     moved = s.turn_rms > 0.1 and s.rate_rms[0] > 0.05 and s.rate_rms[1] > 0.05
-    return moved and s.axis_sd[0] < 0.05 and s.axis_sd[1] < 0.05 and s.pairing > 0.6
+    return moved and s.axis_sd[0] < 0.05 and s.axis_sd[1] < 0.05 and s.pairing > 0.55
 
 
 @compiled

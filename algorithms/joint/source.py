@@ -398,7 +398,7 @@ def axis_remarks(s: Any, segments: tuple[str, ...], fatal: bool = True) -> list[
         if still
         else f"both turn as one body (relative turn {s['turn_rms']:.2f} rad/s)"
         if s["turn_rms"] <= 0.1
-        else f"sd {sd[0]:.1f}° and {sd[1]:.1f}°, pairing {s['pairing']:.2f} of at least 0.6"
+        else f"sd {sd[0]:.1f}° and {sd[1]:.1f}°, pairing {s['pairing']:.2f} of at least 0.55"
     )
     return [
         Remark(

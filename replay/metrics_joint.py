@@ -1,0 +1,218 @@
+"""Figures of merit of joint angles, beside a reference: of all samples and per gait cycle.
+
+Names end in the joint's: ``rmse_deg.knee``. Error = estimate − reference, in degrees, wrapped to ±180°. Estimates are
+interpolated at the reference's times, never across more than 0.1 s; delay is estimated and stated, not removed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+
+from ..algorithms.contract import FloatArray
+from .alignment import IntArray
+
+if TYPE_CHECKING:
+    from .metrics import RunView
+
+SETTLING_S = 1.2
+"""Start of a run that is left out, as in the source."""
+GAP_NS = 100_000_000
+POINTS = 101
+
+
+def wrapped_deg(estimate: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return estimate − reference (rad) in degrees within ±180."""
+    return np.degrees((estimate - reference + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def rmse_deg(error_deg: FloatArray) -> float:
+    """Return the root mean square error."""
+    return float(np.sqrt(np.mean(np.square(error_deg)))) if error_deg.size else float("nan")
+
+
+def bias_deg(error_deg: FloatArray) -> float:
+    """Return the mean error."""
+    return float(np.mean(error_deg)) if error_deg.size else float("nan")
+
+
+def rmse_unbiased_deg(error_deg: FloatArray) -> float:
+    """Return the root mean square error about the mean error."""
+    return float(np.std(error_deg)) if error_deg.size else float("nan")
+
+
+def pearson_r(a: FloatArray, b: FloatArray) -> float:
+    """Return Pearson's correlation; NaN where one does not vary."""
+    if a.size < 2 or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
+        return float("nan")
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def rom_error_deg(estimate: FloatArray, reference: FloatArray) -> float:
+    """Return the error of the range of motion, largest minus smallest angle (rad in, degrees out)."""
+    return float(np.degrees(np.ptp(estimate) - np.ptp(reference))) if estimate.size else float("nan")
+
+
+def bland_altman_deg(error_deg: FloatArray) -> tuple[float, float]:
+    """Return the limits of agreement: mean ∓ 1.96 standard deviations (Bland and Altman 1986)."""
+    if error_deg.size < 2:
+        return float("nan"), float("nan")
+    spread = 1.96 * float(np.std(error_deg, ddof=1))
+    return bias_deg(error_deg) - spread, bias_deg(error_deg) + spread
+
+
+def delay_s(
+    t_ns: IntArray, estimate: FloatArray, ref_ns: IntArray, reference: FloatArray, most_s: float = 0.3
+) -> float:
+    """Return by how much the estimate lags the reference: where the error without its mean is least.
+
+    Whole milliseconds between ± ``most_s``, refined by a parabola. NaN where the reference does not vary.
+    """
+    if len(t_ns) < 10 or len(ref_ns) < 10 or np.ptp(reference) < 1e-3:
+        return float("nan")
+    t0 = int(ref_ns[0])
+    t, r = (t_ns - t0) * 1e-9, (ref_ns - t0) * 1e-9
+    keep = (r > t[0] + most_s) & (r < t[-1] - most_s)
+    if keep.sum() < 10:
+        return float("nan")
+    r, angle = r[keep], reference[keep]
+
+    def spread(shift: float) -> float:
+        return float(np.std(np.interp(r + shift, t, estimate) - angle))
+
+    coarse = np.arange(-most_s, most_s + 1e-9, 0.01)
+    near = coarse[int(np.argmin([spread(s) for s in coarse]))]
+    fine = near + np.arange(-0.01, 0.0101, 0.001)
+    cost = np.array([spread(s) for s in fine]) ** 2
+    k = int(np.argmin(cost))
+    if 0 < k < len(fine) - 1:
+        bend = cost[k - 1] - 2.0 * cost[k] + cost[k + 1]
+        return float(fine[k] + (0.0005 * (cost[k - 1] - cost[k + 1]) / bend if bend > 0.0 else 0.0))
+    return float(fine[k])
+
+
+def cmc(curves: FloatArray) -> float:
+    """Return the coefficient of multiple correlation within a day (Kadaba et al. 1989, eq 1).
+
+    Parameters
+    ----------
+    curves : ndarray, shape (cycles, points)
+        Curves to be compared: cycles of one joint, or estimate and reference of one cycle.
+    """
+    m, n = curves.shape
+    if m < 2:
+        return float("nan")
+    within = float(np.sum((curves - curves.mean(axis=0)) ** 2)) / (n * (m - 1))
+    total = float(np.sum((curves - curves.mean()) ** 2)) / (m * n - 1)
+    return float(np.sqrt(max(0.0, 1.0 - within / total))) if total > 0.0 else float("nan")
+
+
+def cycles_of(
+    t_ns: IntArray, angle: FloatArray, starts_ns: Sequence[int] | IntArray, most_s: float = 4.0
+) -> FloatArray:
+    """Return the angle of every cycle at 0, 1 … 100 %, shape (cycles, 101); NaN across gaps.
+
+    A cycle lies between two neighbouring starts; longer ones than ``most_s`` are pauses and left out.
+    """
+    starts = np.asarray(starts_ns, np.int64)
+    found: list[FloatArray] = []
+    for a, b in pairwise(starts.tolist()):
+        if b - a > most_s * 1e9 or a < t_ns[0] or b > t_ns[-1]:
+            continue
+        at = a + np.linspace(0.0, float(b - a), POINTS)
+        k = np.clip(np.searchsorted(t_ns, at), 1, len(t_ns) - 1)
+        curve = np.interp(at - a, (t_ns - a).astype(np.float64), angle)
+        curve[(t_ns[k] - t_ns[k - 1]) > GAP_NS] = np.nan
+        found.append(curve)
+    return np.array(found) if found else np.empty((0, POINTS))
+
+
+def starts_from_signal(t_ns: IntArray, angle: FloatArray, least_s: float = 0.6) -> IntArray:
+    """Return starts of cycles from a joint angle itself: its main maxima, at least ``least_s`` apart.
+
+    A maximum must reach half of the way from the median to the 99th percentile.
+    """
+    if len(angle) < 3:
+        return np.empty(0, np.int64)
+    from scipy.signal import find_peaks
+
+    step = float(np.median(np.diff(t_ns))) * 1e-9
+    middle, top = float(np.median(angle)), float(np.percentile(angle, 99))
+    peaks, _ = find_peaks(angle, height=middle + 0.5 * (top - middle), distance=max(1, int(least_s / step)))
+    return t_ns[peaks]
+
+
+def matched(
+    t_ns: IntArray, angle: FloatArray, ref_ns: IntArray, reference: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return reference times with a value of both, estimate and reference there, after settling."""
+    good, ok = np.isfinite(angle), np.isfinite(reference)
+    t, angle, r, reference = t_ns[good], angle[good], ref_ns[ok], reference[ok]
+    if len(t) < 2 or len(r) == 0:
+        return r[:0], angle[:0], reference[:0]
+    k = np.clip(np.searchsorted(t, r), 1, len(t) - 1)
+    inside = (r >= t[0] + int(SETTLING_S * 1e9)) & (r <= t[-1]) & (t[k] - t[k - 1] <= GAP_NS)
+    r, reference = r[inside], reference[inside]
+    value = np.interp((r - t[0]).astype(np.float64), (t - t[0]).astype(np.float64), np.unwrap(angle))
+    return r, value, reference
+
+
+def figures(t_ns: IntArray, angle: FloatArray, ref_ns: IntArray, reference: FloatArray) -> dict[str, float]:
+    """Return all figures of one joint, names without the joint's."""
+    at, value, truth = matched(t_ns, angle, ref_ns, reference)
+    if at.size == 0:
+        return {}
+    error = wrapped_deg(value, truth)
+    low, high = bland_altman_deg(error)
+    good = np.isfinite(angle)
+    found = {
+        "rmse_deg": rmse_deg(error),
+        "rmse_unbiased_deg": rmse_unbiased_deg(error),
+        "bias_deg": bias_deg(error),
+        "pearson_r": pearson_r(value, truth),
+        "rom_error_deg": rom_error_deg(value, truth),
+        "delay_s": delay_s(t_ns[good], np.unwrap(angle[good]), at, truth),
+        "agreement_low_deg": low,
+        "agreement_high_deg": high,
+    }
+    starts = starts_from_signal(at, truth)
+    ours, theirs = cycles_of(at, value, starts), cycles_of(at, truth, starts)
+    whole = np.isfinite(ours).all(axis=1) & np.isfinite(theirs).all(axis=1)
+    if whole.sum() >= 2:
+        ours, theirs = ours[whole], theirs[whole]
+        each = wrapped_deg(ours, theirs)
+        found["cycles"] = float(len(ours))
+        found["cycle_rmse_deg"] = float(np.mean(np.sqrt(np.mean(each**2, axis=1))))
+        found["cycle_rom_error_deg"] = float(
+            np.degrees(np.mean(np.ptp(ours, axis=1) - np.ptp(theirs, axis=1)))
+        )
+        found["cmc"] = float(np.mean([cmc(np.stack(pair)) for pair in zip(ours, theirs, strict=True)]))
+    return found
+
+
+def joints(view: RunView) -> dict[str, float]:
+    """Errors of joint angles: RMSE, bias, correlation, range of motion, delay, limits of agreement, cycles."""
+    ours, truth = view.table("joint"), view.reference_table("joint")
+    if ours is None or truth is None:
+        return {}
+    found: dict[str, float] = {}
+    for name in _joints(ours):
+        if name in truth.columns:
+            values = figures(*_column(ours, name), *_column(truth, name))
+            found.update({f"{key}.{name}": value for key, value in values.items()})
+    return found
+
+
+def _joints(table: pl.DataFrame) -> list[str]:
+    return [c for c in table.columns if c not in ("t_ns", "t_log_ns") and not c.endswith((".vel", ".effort"))]
+
+
+def _column(table: pl.DataFrame, name: str) -> tuple[IntArray, FloatArray]:
+    t = table["t_ns"].to_numpy()
+    value = table[name].cast(pl.Float64).to_numpy()
+    keep = np.r_[True, np.diff(np.maximum.accumulate(t)) > 0]
+    return t[keep], value[keep]
