@@ -54,6 +54,8 @@ def test_cycles_run_from_start_to_start_without_pauses() -> None:
     starts = np.array([0, 1_200_000_000, 2_400_000_000, 9_000_000_000])
     curves = mj.cycles_of(T, ANGLE, starts)
     assert curves.shape == (2, 101)
-    np.testing.assert_allclose(curves[0], np.radians(30 + 30 * np.sin(np.linspace(0, 2 * np.pi, 101))), atol=1e-3)
+    np.testing.assert_allclose(
+        curves[0], np.radians(30 + 30 * np.sin(np.linspace(0, 2 * np.pi, 101))), atol=1e-3
+    )
     found = mj.starts_from_signal(T, ANGLE)
     np.testing.assert_allclose(np.diff(found) * 1e-9, 1.2, atol=0.011)

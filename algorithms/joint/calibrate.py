@@ -139,9 +139,10 @@ class JointCalibrator(Calibrator):
         hint = w["axis"].copy()
         lag = max(1, round(0.3 * rate / step))
         paired = False
-        for _ in range(2):
+        for _ in range(3):
             w["axis"] = hint
             paired = axisfit.fit_axes(work[0], rows, len(rows), lag, p.sd_gyr, p.sd_acc, p.gravity)
+            axisfit.fit_position(work[0], rows, len(rows), 3.0)  # nearly least squares: a wide basin
             axisfit.fit_position(work[0], rows, len(rows), 0.5)
         sd = np.degrees(w["axis_sd"])
         still = [n for n, r in zip((upper, lower), w["rate_rms"], strict=True) if r <= 0.05]
