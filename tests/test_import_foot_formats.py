@@ -340,6 +340,27 @@ def test_sensorconnect_gives_body_axes_and_attitude_against_z_up(tmp_path: Path,
     assert "truth" not in imported.metadata
 
 
+def test_sensorconnect_estimated_columns_and_their_flags(tmp_path: Path, truth: Walk) -> None:
+    acc, gyr = turned_down(truth.acc_b), turned_down(truth.gyr_b)
+    valid = np.ones(len(truth.t))
+    valid[100:103] = 0
+    fields = [f"estCompensatedAccel{a}" for a in "XYZ"] + [f"estAngularRate{a}" for a in "XYZ"]
+    names = ["Time", *(f"n:{f}{end}" for f in fields for end in ("", ":valid"))]
+    values = [truth.t]
+    for k, column in enumerate((*acc.T, *gyr.T)):
+        values += [column, valid if k == 3 else np.ones(len(valid))]
+    (path := tmp_path / "w.csv").write_bytes(lines(",".join(names), np.column_stack(values)))
+    _, tables, report = read(SensorConnectCsv(), path)
+    imu = tables["/foot/imu"]
+    np.testing.assert_allclose(imu.select("acc_x", "acc_y", "acc_z"), acc, atol=1e-6)
+    got = imu.select("gyr_x", "gyr_y", "gyr_z").to_numpy()
+    assert np.isnan(got[100:103, 0]).all()
+    np.testing.assert_allclose(
+        np.delete(got, slice(100, 103), axis=0), np.delete(gyr, slice(100, 103), axis=0)
+    )
+    assert findings(report)["invalid_value"] == 3
+
+
 @pytest.mark.parametrize("way", ["beside", "option", "second input"])
 def test_sensorconnect_footprints(tmp_path: Path, truth: Walk, way: str) -> None:
     (path := tmp_path / "w.csv").write_bytes(sensorconnect(truth))

@@ -1,9 +1,11 @@
 """CSV that MicroStrain's SensorConnect exports, with the footprints of the walk where they were measured.
 
 Columns are ``Time`` (s) and ``<node>:<field>``: ``scaledAccelX`` (g), ``scaledGyroX`` (rad/s),
-``scaledMagX`` (gauss), ``roll``, ``pitch``, ``yaw`` (rad, of the device's own filter). The device's body
-axes are x forward, y right, z down (at rest the accelerometer reads −1 g on z) and are kept. Its attitude is
-against north, east, down; here it is turned into ``rot_nb`` with n = north, west, up.
+``scaledMagX`` (gauss), ``roll``, ``pitch``, ``yaw`` (rad, of the device's own filter); or, from its estimation
+filter, ``estCompensatedAccelX`` (m/s², bias taken off), ``estAngularRateX`` (rad/s), ``estRoll`` …, each with a
+column ``…:valid`` (0: the device says that the value is none). Where both are there, the scaled ones count.
+The device's body axes are x forward, y right, z down (at rest the accelerometer reads −1 g on z) and are
+kept. Its attitude is against north, east, down; here it is turned into ``rot_nb`` with n = north, west, up.
 
 Footprints are a second table ``strideIndex,timestamp,gcpX,gcpY`` (index of the row, s, m, m), found beside
 the log by its name (``<stem>_….csv``), or named by the option ``footprints``, or given as a second input.
@@ -65,8 +67,17 @@ REFERENCE = ChannelSpec(
 )
 QUAT = ("quat_w", "quat_x", "quat_y", "quat_z")
 
-_FIELDS = {"scaledAccel": ("acc", "g"), "scaledGyro": ("gyr", "rad/s"), "scaledMag": ("mag", "gauss")}
-_ANGLES = ("roll", "pitch", "yaw")
+_FIELDS = {
+    "estCompensatedAccel": ("acc", "m/s2"),
+    "estAngularRate": ("gyr", "rad/s"),
+    "scaledAccel": ("acc", "g"),
+    "scaledGyro": ("gyr", "rad/s"),
+    "scaledMag": ("mag", "gauss"),
+}
+"""Quantity and unit of a field; of two for one quantity the later counts."""
+_ACCELERATIONS = (":scaledAccelX", ":estCompensatedAccelX")
+_ANGLES = (("roll", "pitch", "yaw"), ("estRoll", "estPitch", "estYaw"))
+_VALID = ":valid"
 #: A walk whose last footprint is so near to its first (share of its length) is closed.
 CLOSED = 0.005
 
@@ -101,7 +112,7 @@ class SensorConnectCsv:
     joins: ClassVar[bool] = True
 
     def sniff(self, head: bytes, path: Path) -> float:
-        """A header with ``Time`` and ``<node>:scaledAccelX``."""
+        """A header with ``Time`` and ``<node>:scaledAccelX`` or ``<node>:estCompensatedAccelX``."""
         return 0.95 if find_header(head, _is_header) else 0.0
 
     def read(self, paths: Sequence[Path], options: SensorConnectOptions) -> Import:
@@ -111,15 +122,16 @@ class SensorConnectCsv:
         node = _node(path, header, options.node)
         columns = _columns(header, node)
         report = ReportBuilder()
-        angles = {a: f"{node}:{a}" for a in _ANGLES if f"{node}:{a}" in header.names}
+        angles = next((n for a in _ANGLES if set(n := [f"{node}:{x}" for x in a]) <= set(header.names)), [])
         imu = complete(columns, ACC) | complete(columns, GYR)
-        if len(angles) == 3:
+        if angles:
             imu |= {q: Source(q, 1.0) for q in QUAT}
         plans = [Plan("/foot/imu", IMU, imu, metadata={"node": node})]
         if field := complete(columns, FIELD):
             plans.append(Plan("/foot/mag", MAG, field, metadata={"node": node}))
-        used = {s.name for p in plans for s in p.columns.values()} | {"Time", *angles.values()}
-        note_unused(header.names, used, report, header.line)
+        used = {s.name for p in plans for s in p.columns.values()} | {"Time", *angles}
+        flags = {f"{n}{_VALID}" for n in used} & set(header.names)
+        note_unused(header.names, used | flags, report, header.line)
         metadata = {
             "device": {
                 "clock": "device",
@@ -136,7 +148,7 @@ class SensorConnectCsv:
             note_mirror(options.mirror, truth.name, footprints.height, report)
             specs.append(REFERENCE)
         clock = Clock(report, tick_ns=1)
-        frames = _frames(path, header, angles if len(angles) == 3 else {}, report)
+        frames = _frames(path, header, angles, sorted(flags), report)
         return Import(
             channels=specs,
             blocks=_with_footprints(tables(path, frames, plans, clock, report), footprints, truth, report),
@@ -146,7 +158,7 @@ class SensorConnectCsv:
 
 
 def _is_header(cells: Sequence[str]) -> bool:
-    return cells[0] == "Time" and any(c.endswith(":scaledAccelX") for c in cells)
+    return cells[0] == "Time" and any(c.endswith(_ACCELERATIONS) for c in cells)
 
 
 def _is_footprints(cells: Sequence[str]) -> bool:
@@ -185,7 +197,7 @@ def _inputs(paths: Sequence[Path], options: SensorConnectOptions) -> tuple[Path,
 
 
 def _node(path: Path, header: Header, wanted: str | None) -> str:
-    nodes = list(dict.fromkeys(n.rpartition(":")[0] for n in header.names if n.endswith(":scaledAccelX")))
+    nodes = list(dict.fromkeys(n.rpartition(":")[0] for n in header.names if n.endswith(_ACCELERATIONS)))
     if wanted is None and len(nodes) == 1:
         return nodes[0]
     if wanted in nodes:
@@ -196,21 +208,33 @@ def _node(path: Path, header: Header, wanted: str | None) -> str:
 
 def _columns(header: Header, node: str) -> dict[str, Source]:
     found = {}
-    for name in header.names:
-        field = name.removeprefix(f"{node}:")
-        if field[:-1] in _FIELDS and field[-1] in "XYZ":
-            quantity, unit = _FIELDS[field[:-1]]
-            factor, _ = conversion(unit, SI[quantity])
-            found[f"{quantity}_{field[-1].lower()}"] = Source(name, factor)
+    for field, (quantity, unit) in _FIELDS.items():
+        factor, _ = conversion(unit, SI[quantity])
+        for axis in "XYZ":
+            if (name := f"{node}:{field}{axis}") in header.names:
+                found[f"{quantity}_{axis.lower()}"] = Source(name, factor)
     return found
 
 
 def _frames(
-    path: Path, header: Header, angles: dict[str, str], report: ReportBuilder
+    path: Path, header: Header, angles: Sequence[str], flags: Sequence[str], report: ReportBuilder
 ) -> Iterator[pl.DataFrame]:
     for frame in float_blocks(path, header, "Time", report):
+        for flag in flags:
+            invalid = frame[flag].fill_nan(0.0) == 0.0
+            if invalid.any():
+                report.note(
+                    "invalid_value",
+                    f"{path}: the device says by {flag} = 0 that the value is none; it is left empty",
+                    count=int(invalid.sum()),
+                    line=int(frame["line"].filter(invalid)[0]),
+                    subject=flag,
+                )
+                value = flag.removesuffix(_VALID)
+                frame = frame.with_columns(pl.when(invalid).then(None).otherwise(pl.col(value)).alias(value))
+                frame = frame.with_columns(pl.col(value).fill_null(float("nan")))
         if angles:
-            quat = _north_west_up(*(frame[angles[a]].to_numpy() for a in _ANGLES))
+            quat = _north_west_up(*(frame[a].to_numpy() for a in angles))
             frame = frame.with_columns(*(pl.Series(n, q) for n, q in zip(QUAT, quat, strict=True)))
         yield frame.with_columns(t=(pl.col("Time") * 1e9).round().cast(pl.Int64)).drop("Time")
 
