@@ -133,8 +133,8 @@ def anchors_of(context: Context, *, without: str = "", need_model: bool = True) 
     else:
         raise AlgorithmError(
             f"no anchor positions: the recording has no attachment {ATTACHMENT} "
-            "(mac,technology,x,y,z,p_d0,eta,name); convert it with the anchor table, or run indoor.fingerprint "
-            "with surveyed points, or dead reckoning: phone.pdr, indoor.pdr"
+            "(mac,technology,x,y,z,p_d0,eta,name); convert it with the anchor table, or run dead reckoning: "
+            "phone.pdr, indoor.pdr"
         )
     out = set(without.replace(",", " ").lower().split())
     unknown = out - {r["mac"] for r in rows} - {r["name"].lower() for r in rows}
