@@ -46,12 +46,25 @@ def save(picture: Picture, path: Path) -> None:
     print(path)
 
 
+def domains(folder: Path, images: Path) -> None:
+    """Take the pictures of a phone, of radio indoors and of a leg, from the small recordings of the tests."""
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    from tests import viz_walks
+
+    for name, tab in (("phone", "Overview"), ("indoor", "Overview"), ("leg", "Joints")):
+        rec = getattr(viz_walks, name)(folder / f"{name}.mcap")
+        rrd = viz.write_rrd(rec, folder / f"{name}.rrd")
+        for picture in screenshots(rrd, [tab], at=0.7):
+            save(picture, images / f"viewer-{name}.png")
+
+
 def main() -> None:
     """Make all pictures."""
     images = Path(sys.argv[1]) if len(sys.argv) > 1 else IMAGES
     images.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
+        domains(folder, images)
         walk = replayed(folder, "rectangle", FILTERS, "rectangle")
         rrd = viz.write_rrd(walk, folder / "rectangle.rrd")
         for picture in screenshots(rrd, ["Overview", "Raw", "Compare", "Report"], at=0.62):

@@ -77,6 +77,7 @@ def _tab(name: str, canvases: Sequence[Canvas], entries: Sequence[Entry]) -> rrb
     if name == COMPARE:
         tracks = [e for e in entries if e.kind == "space" and e.panel == SPACE]
         left = [_above(canvases, tracks)] if tracks else []
+        mine.sort(key=lambda e: 0 if e.panel == DISTANCE else 1 if e.stack == "error" else 2)
         right = _panels(mine, canvases) or _panels([e for e in entries if e.panel == HEIGHT], canvases)
         return _beside(name, left, right, [1, 1])
     if name == DETECTOR:
