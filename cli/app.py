@@ -43,6 +43,7 @@ COMMANDS: tuple[tuple[Group, str, str, str], ...] = (
     (RAW, "formats", "available:formats", "List the formats that can be read and written."),
     (RAW, "simulate", "simulate:simulate", "Write raw logs of a simulated walk with known truth."),
     (RAW, "convert", "convert:convert", "Turn raw logs into recordings and report every defect."),
+    (RAW, "align", "align:align", "Move the optical clock of a recording to the inertial one."),
     (WORK, "info", "contents:info", "Show what a recording holds."),
     (WORK, "check", "contents:check", "Look for what is wrong with a recording."),
     (WORK, "estimators", "available:estimators", "List the estimators, and the parameters of those named."),
