@@ -42,7 +42,7 @@ def save(picture: Picture, path: Path) -> None:
     if picture.reports:
         raise SystemExit(f"{path.name}: {'; '.join(picture.reports)}")
     image = Image.open(io.BytesIO(picture.png)).convert("RGB")
-    image.crop((0, FRAME, *image.size)).quantize(256).save(path, optimize=True)
+    image.crop((0, FRAME, *image.size)).quantize(64, dither=Image.Dither.NONE).save(path, optimize=True)
     print(path)
 
 
