@@ -38,7 +38,7 @@ class TableExporter:
     Options: ClassVar[type[msgspec.Struct]] = Selection
 
     @abstractmethod
-    def write(self, stream: pl.LazyFrame, file: Path, about: dict[str, str]) -> None:
+    def write(self, stream: _Stream, file: Path, about: dict[str, str]) -> None:
         """Write ``stream`` to ``file`` with bounded memory, and the facts ``about`` it where it can."""
 
     def losses(self, rec: Recording, options: Any) -> list[str]:
@@ -90,7 +90,7 @@ class TableExporter:
     def _write_channel(self, stream: _Stream, file: Path, about: dict[str, str]) -> int:
         """Write one channel, return its rows; a full disk becomes an ``OSError``, whatever Polars says."""
         try:
-            self.write(stream.frame, file, about)
+            self.write(stream, file, about)
         except (OSError, pl.exceptions.ComputeError) as error:
             if stream.failure is not None:
                 raise stream.failure from None
@@ -107,12 +107,13 @@ class CsvExporter(TableExporter):
     title = "folder of CSV files, one a channel, units in channels.json, events.tsv (spreadsheets, R, MATLAB)"
     file_suffix = ".csv"
 
-    def write(self, stream: pl.LazyFrame, file: Path, about: dict[str, str]) -> None:
+    def write(self, stream: _Stream, file: Path, about: dict[str, str]) -> None:
         """Write one CSV file; lists and structs become JSON text in one cell."""
-        nested = [name for name, dtype in stream.collect_schema().items() if dtype.is_nested()]
-        stream.with_columns(pl.col(name).map_elements(_json_cell, pl.String) for name in nested).sink_csv(
-            file
-        )
+        with file.open("wb") as out:  # window by window: a lazy sink keeps half a megabyte of every call
+            for number, table in enumerate(stream.tables()):
+                nested = [name for name, dtype in table.schema.items() if dtype.is_nested()]
+                cells = table.with_columns(pl.col(n).map_elements(_json_cell, pl.String) for n in nested)
+                cells.write_csv(out, include_header=number == 0)
 
 
 class ParquetExporter(TableExporter):
@@ -122,9 +123,9 @@ class ParquetExporter(TableExporter):
     title = "folder of Parquet files, one a channel, with units in channels.json (Polars, pandas, DuckDB, R)"
     file_suffix = ".parquet"
 
-    def write(self, stream: pl.LazyFrame, file: Path, about: dict[str, str]) -> None:
+    def write(self, stream: _Stream, file: Path, about: dict[str, str]) -> None:
         """Write one Parquet file."""
-        stream.sink_parquet(file, metadata=about)
+        stream.frame.sink_parquet(file, metadata=about)
 
 
 def _json_cell(value: Any) -> str:
@@ -137,8 +138,6 @@ class _Stream:
 
     Attributes
     ----------
-    frame : polars.LazyFrame
-        The stream; can be read once.
     rows : int
         Rows that have passed.
     failure : BaseException or None
@@ -146,8 +145,6 @@ class _Stream:
     """
 
     def __init__(self, rec: Recording, topic: str, options: Selection) -> None:
-        from polars.io.plugins import register_io_source
-
         self._tables = _tables(rec, topic, options)
         first = next(self._tables, None)
         if first is None:
@@ -155,7 +152,24 @@ class _Stream:
         self._first = first
         self.rows = 0
         self.failure: BaseException | None = None
-        self.frame = register_io_source(self._source, schema=dict(first.schema))
+
+    @property
+    def frame(self) -> pl.LazyFrame:
+        """The windows as a lazy frame, which can be read once."""
+        from polars.io.plugins import register_io_source
+
+        return register_io_source(self._source, schema=dict(self._first.schema))
+
+    def tables(self) -> Iterator[pl.DataFrame]:
+        """Yield the windows; the first one is there even where it is empty."""
+        schema = self._first.schema
+        try:
+            for table in chain([self._first], self._tables):
+                self.rows += table.height
+                yield table.select(pl.col(name).cast(dtype) for name, dtype in schema.items())
+        except Exception as error:
+            self.failure = error
+            raise
 
     def _source(
         self, columns: list[str] | None, predicate: pl.Expr | None, n_rows: int | None, batch_size: int | None
