@@ -325,6 +325,14 @@ class JointSmea(SourceFilter):
     title: ClassVar[str] = "Markov-jump filter with self-aligned joint angle, no encoder (SMeA)"
     source: ClassVar[str] = "joint dissertation, eqs 68–84, table 4"
     Params = SmeaParams
+    presets: ClassVar[dict[str, dict[str, Any]]] = {
+        "tuned": {
+            "sigma2_joint": 1e-3,
+            "sigma2_acc_thigh": 0.02,
+            "sigma2_acc_shank": 0.02,
+            "sigma2_alpha": 0.01,
+        }
+    }
     kind: ClassVar[int] = linear.SELF
     axes: ClassVar[int] = 3
     lookahead = 2
