@@ -25,7 +25,7 @@ def simulate(
     output: Output,
     option: Annotated[Strings, Parameter(name="--set")] = (),
     seed: Annotated[int, Shown] = 0,
-    format: Annotated[Literal["text", "packets"], Shown] = "text",
+    format: Annotated[Literal["text", "packets", "android-text", "phyphox", "sensor-logger"], Shown] = "text",
     name: str | None = None,
     force: Force = False,
     common: Common = DEFAULT,
@@ -35,7 +35,9 @@ def simulate(
     Parameters
     ----------
     scenario : str
-        rectangle, straight, figure-eight, stairs or still; of legs: walking, sit-to-stand or squats.
+        rectangle, straight, figure-eight, stairs or still; of legs: walking, sit-to-stand or squats;
+        of a phone: phone-10m, phone-50m, phone-100m, phone-turns, phone-loop, phone-city, phone-floors,
+        phone-rest, phone-handled.
     output : Path
         Folder for the raw logs and the truth beside them.
     option : str
@@ -43,7 +45,8 @@ def simulate(
     seed : int
         Seed of every random number: the same seed gives the same files.
     format : str
-        What the device writes: serial text or binary packets.
+        What the device writes: serial text or binary packets; of a phone android-text, phyphox or
+        sensor-logger.
     name : str
         Middle of the file names; SCENARIO-SEED without it.
     force : bool

@@ -5,6 +5,7 @@ the foot is still; it becomes ``/reference/pose``, ``/reference/velocity`` and `
 ``<stem>.truth.imu2.csv`` has the same of sensor 2, for ``/reference/imu2/pose`` and so on.
 ``<stem>.truth.leg.csv`` has ``t_ns``, columns ``joint.<name>`` (rad) and ``<segment>.quat_w`` …, for
 ``/reference/joint`` and ``/reference/<segment>/orientation``.
+``<stem>.truth.steps.csv`` has the steps of a person with a phone, for ``/reference/steps``; stance is left out.
 ``<stem>.truth.toml`` holds facts (closed, length_m, scenario, seed …) for the metadata record ``truth``.
 """
 
@@ -22,6 +23,7 @@ from ..recording.errors import MarchaError
 from .contract import ChannelSpec
 
 POSE = ("pos_x", "pos_y", "pos_z", "quat_w", "quat_x", "quat_y", "quat_z")
+STEP = "marcha_msgs/msg/Step"
 VELOCITY = ("vel_x", "vel_y", "vel_z")
 
 SCHEMAS = (
@@ -66,6 +68,9 @@ def read_truth(path: Path) -> Truth | None:
     parts = {"": f"{path.stem}.truth.csv", "imu2/": f"{path.stem}.truth.imu2.csv"}
     tables = []
     files = []
+    if (steps := path.with_name(f"{path.stem}.truth.steps.csv")).is_file():
+        files.append(steps)
+        tables.append((ChannelSpec("/reference/steps", STEP, "nav"), _steps(steps)))
     for part, name in parts.items():
         if (file := path.with_name(name)).is_file():
             files.append(file)
@@ -73,6 +78,7 @@ def read_truth(path: Path) -> Truth | None:
             tables += [
                 (ChannelSpec(f"/reference/{part}{what}", schema, "nav"), table.select("t_ns", *columns))
                 for what, schema, columns in SCHEMAS
+                if what != "stance" or not steps.is_file()
             ]
     if (file := path.with_name(f"{path.stem}.truth.leg.csv")).is_file() and path.suffix != ".trc":
         files.append(file)
@@ -125,6 +131,19 @@ def _flat(prefix: str, facts: dict[str, object]) -> Iterator[tuple[str, str]]:
             yield from _flat(f"{prefix}{key}.", value)
         else:
             yield f"{prefix}{key}", as_text(value)
+
+
+def _steps(file: Path) -> pl.DataFrame:
+    """Return the steps, each at the contact that ends it."""
+    whole = {"start_ns": pl.Int64, "end_ns": pl.Int64, "index": pl.UInt32}
+    columns = whole | dict.fromkeys(("length_m", "height_m", "heading_rad"), pl.Float64)
+    try:
+        table = pl.read_csv(file, schema_overrides=columns).select(pl.col("end_ns").alias("t_ns"), *columns)
+    except (OSError, pl.exceptions.PolarsError) as error:
+        raise MarchaError(f"{file}: not a readable table of steps: {str(error).splitlines()[0]}") from error
+    if table.null_count().sum_horizontal().item() or not table["t_ns"].is_sorted():
+        raise MarchaError(f"{file}: a table of steps has no empty cells and its time never decreases")
+    return table
 
 
 def _table(file: Path) -> pl.DataFrame:

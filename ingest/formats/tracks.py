@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -67,7 +67,7 @@ class Kml:
 Point = tuple[str, float, float, float]
 
 
-def _track(path: Path, name: str, options: TrackOptions, points: object) -> Import:
+def _track(path: Path, name: str, options: TrackOptions, points: Callable[[Path], Iterator[Point]]) -> Import:
     report = ReportBuilder()
     topic = "/phone/gnss" if options.role == "fixes" else "/reference/fix"
     part = fix_part({"lat": "lat", "lon": "lon", "alt": "alt"}, topic)
@@ -81,9 +81,8 @@ def _track(path: Path, name: str, options: TrackOptions, points: object) -> Impo
 
 
 def _blocks(
-    path: Path, stream: Stream, points: object, report: ReportBuilder
+    path: Path, stream: Stream, points: Callable[[Path], Iterator[Point]], report: ReportBuilder
 ) -> Iterator[tuple[str, pl.DataFrame]]:
-    assert callable(points)
     try:
         found: list[Point] = list(points(path))
     except OSError as error:

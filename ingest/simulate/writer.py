@@ -18,6 +18,7 @@ from .gait import Motion
 from .leg import SCENARIOS as LEGS
 from .leg import leg
 from .legfiles import files
+from .phone_routes import PHONE_SCENARIOS
 from .walks import Simulation, checked, make_options
 
 CHATTER = (
@@ -100,7 +101,7 @@ def simulate(
     *,
     seed: int = 0,
     name: str | None = None,
-    format: Literal["text", "packets"] = "text",
+    format: Literal["text", "packets", "android-text", "phyphox", "sensor-logger"] = "text",
     overwrite: bool = False,
     **options: Any,
 ) -> Simulated:
@@ -114,7 +115,7 @@ def simulate(
     Parameters
     ----------
     scenario : str
-        A key of :data:`SCENARIOS`.
+        A key of :data:`SCENARIOS` or of :data:`PHONE_SCENARIOS`.
     out_dir : Path or str
         Folder of the files; made where it is missing.
     seed : int
@@ -122,11 +123,11 @@ def simulate(
     name : str, optional
         Middle of the file names; default ``<scenario>-<seed>``.
     format : str
-        ``text`` or ``packets``.
+        ``text`` or ``packets``; of a phone ``android-text`` (or ``text``), ``phyphox`` or ``sensor-logger``.
     overwrite : bool
         Replace files that are there.
     **options
-        Fields of :class:`Options` and of :class:`Line`.
+        Fields of :class:`Options` and of :class:`Line`; of a phone those of :class:`PhoneOptions`.
 
     Returns
     -------
@@ -142,6 +143,14 @@ def simulate(
     """
     if scenario in LEGS:
         return _leg(scenario, Path(out_dir), seed, name, format, overwrite, options)
+    if scenario in PHONE_SCENARIOS:
+        from .phone_files import write_phone
+
+        kind = "android-text" if format == "text" else format
+        paths, truth, walked = write_phone(
+            scenario, Path(out_dir), seed=seed, name=name, format=kind, overwrite=overwrite, options=options
+        )
+        return Simulated(paths, truth, len(walked.t_ns), walked.closed, walked.length_m)
     if format not in ("text", "packets"):
         raise UsageError(f"simulate: format {format!r} is unknown: choose text or packets")
     line_given = {k: options.pop(k) for k in Line.__struct_fields__ if k in options}

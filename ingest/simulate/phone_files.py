@@ -1,0 +1,175 @@
+"""A simulated phone as the files of a logger app, and the truth beside them."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import polars as pl
+
+from ...recording.errors import MarchaError, OutputExists, UsageError
+from .phone import PhoneWalk, phone_walk
+from .phone_world import RADIAL_68
+
+PHONE_FORMATS = ("android-text", "phyphox", "sensor-logger")
+
+
+def write_phone(
+    scenario: str,
+    folder: Path,
+    *,
+    seed: int,
+    name: str | None,
+    format: str,
+    overwrite: bool,
+    options: dict[str, Any],
+) -> tuple[list[Path], list[Path], PhoneWalk]:
+    """Write the log of a simulated phone and its truth; return both and the walk.
+
+    Files: ``phone-<name>.txt``, or a folder ``phone-<name>`` as the app exports it; ``….truth.csv`` (the walker's
+    place on the ground in east, true north, up; the phone's attitude; ``still`` while nobody walks),
+    ``….truth.steps.csv`` (a row a step) and ``….truth.toml``.
+
+    Raises
+    ------
+    UsageError
+        Unknown format or option.
+    OutputExists
+        A file is there already.
+    """
+    if format not in PHONE_FORMATS:
+        raise UsageError(
+            f"simulate {scenario}: format {format!r} is unknown: choose {', '.join(PHONE_FORMATS)}"
+        )
+    walk = phone_walk(scenario, seed=seed, **options)
+    stem = name or f"{scenario}-{seed:03d}"
+    log = folder / (f"{stem}.txt" if format == "android-text" else stem)
+    truths = [folder / f"{stem}.truth{part}" for part in (".csv", ".steps.csv", ".toml")]
+    for path in (log, *truths):
+        if path.exists() and not overwrite:
+            raise OutputExists(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder, prefix=".marcha-") as made:
+            part = Path(made)
+            _WRITERS[format](part / log.name, walk)
+            origin = 0 if format != "phyphox" else int(walk.t_ns[0])
+            _truth(walk, origin).write_csv(part / truths[0].name)
+            steps = walk.steps.with_columns(pl.col("start_ns") - origin, pl.col("end_ns") - origin)
+            steps.write_csv(part / truths[1].name)
+            (part / truths[2].name).write_bytes(msgspec.toml.encode(_facts(walk, format)))
+            for path in (log, *truths):
+                if path.is_dir():
+                    shutil.rmtree(path)
+                (part / path.name).replace(path)
+    except OSError as error:
+        raise MarchaError(f"{error.filename or folder}: cannot write: {error.strerror or error}") from error
+    return [log], truths, walk
+
+
+def _held(walk: PhoneWalk) -> np.ndarray:
+    """Return latitude, longitude, height of the last fix at every sample; NaN before the first."""
+    values = walk.fixes.select("lat_deg", "lon_deg", "alt_m").to_numpy()
+    at = np.searchsorted(walk.fixes["t_ns"].to_numpy(), walk.t_ns, side="right") - 1
+    if not len(values):
+        return np.full((len(at), 3), np.nan)
+    return np.where((at < 0)[:, None], np.nan, values[np.maximum(at, 0)])
+
+
+def _android_text(path: Path, walk: PhoneWalk) -> None:
+    """Write the rows from the first fix on, as the app does: it waits for one; without GNSS there are none."""
+    place = _held(walk)
+    there = ~np.isnan(place[:, 0])
+    columns = [walk.t_ns // 1_000_000, *walk.acc_b.T, *np.round(walk.mag_b * 1e6, 3).T, *place.T]
+    table = pl.DataFrame({f"c{k}": v for k, v in enumerate(columns)}).filter(pl.Series(there))
+    period = round(1000 / walk.options.rate_hz)
+    head = f"@Date: {np.datetime64(int(walk.t_ns[0]), 'ns')} UTC\n@ Sensors: simulated\n@ SamplingTime: {period}ms\n\n"
+    path.write_text(head + table.write_csv(include_header=False, line_terminator="#\n"), encoding="utf-8")
+
+
+def _csv(path: Path, header: list[str], columns: list[np.ndarray]) -> None:
+    table = pl.DataFrame({f"c{k}": v for k, v in enumerate(columns)})
+    path.write_text(",".join(header) + "\n" + table.write_csv(include_header=False), encoding="utf-8")
+
+
+def _phyphox(path: Path, walk: PhoneWalk) -> None:
+    path.mkdir()
+    start = walk.t_ns[0]
+    t = (walk.t_ns - start) / 1e9
+    for name, unit, values in (
+        ("Accelerometer", "m/s^2", walk.acc_b),
+        ("Gyroscope", "rad/s", walk.gyr_b),
+        ("Magnetometer", "µT", walk.mag_b * 1e6),
+    ):
+        header = ['"Time (s)"', *(f'"{a} ({unit})"' for a in "XYZ")]
+        _csv(path / f"{name}.csv", header, [t, *values.T])
+    f = walk.fixes
+    none = np.full(f.height, -1.0)
+    names = ["Time (s)", "Latitude (°)", "Longitude (°)", "Height (m)", "Velocity (m/s)", "Direction (°)"]
+    names += ["Horizontal Accuracy (m)", "Vertical Accuracy (m)"]
+    columns = [
+        (f["t_ns"].to_numpy() - start) / 1e9,
+        *(f[c].to_numpy() for c in ("lat_deg", "lon_deg", "alt_m")),
+    ]
+    columns += [none, none, f["sd_east_m"].to_numpy() * RADIAL_68, f["sd_up_m"].to_numpy()]
+    _csv(path / "Location.csv", [f'"{n}"' for n in names], columns)
+    p = walk.pressure
+    if p.height:
+        seconds = (p["t_ns"].to_numpy() - start) / 1e9
+        _csv(path / "Pressure.csv", ['"Time (s)"', '"X (hPa)"'], [seconds, p["pressure_pa"].to_numpy() / 100])
+
+
+def _sensor_logger(path: Path, walk: PhoneWalk) -> None:
+    path.mkdir()
+    start = walk.t_ns[0]
+
+    def write(name: str, names: list[str], t: np.ndarray, columns: list[np.ndarray]) -> None:
+        _csv(path / f"{name}.csv", ["time", "seconds_elapsed", *names], [t, (t - start) / 1e9, *columns])
+
+    for name, values in (
+        ("TotalAcceleration", walk.acc_b),
+        ("Gyroscope", walk.gyr_b),
+        ("Magnetometer", walk.mag_b * 1e6),
+    ):
+        write(name, ["z", "y", "x"], walk.t_ns, list(values[:, ::-1].T))
+    f = walk.fixes
+    names = ["verticalAccuracy", "horizontalAccuracy", "altitude", "longitude", "latitude"]
+    columns = [f["sd_up_m"].to_numpy(), f["sd_east_m"].to_numpy() * RADIAL_68]
+    columns += [f[c].to_numpy() for c in ("alt_m", "lon_deg", "lat_deg")]
+    write("Location", names, f["t_ns"].to_numpy(), columns)
+    if walk.pressure.height:
+        hecto = walk.pressure["pressure_pa"].to_numpy() / 100
+        write("Barometer", ["pressure"], walk.pressure["t_ns"].to_numpy(), [hecto])
+    about = "version,device name,platform,standardisation\n3,simulated,android,false\n"
+    (path / "Metadata.csv").write_text(about, encoding="utf-8")
+
+
+_WRITERS = {"android-text": _android_text, "phyphox": _phyphox, "sensor-logger": _sensor_logger}
+
+
+def _truth(walk: PhoneWalk, origin: int) -> pl.DataFrame:
+    columns: dict[str, Any] = {"t_ns": walk.t_ns - origin}
+    columns |= dict(zip(("pos_x", "pos_y", "pos_z"), walk.pos.T, strict=True))
+    columns |= dict(zip(("quat_w", "quat_x", "quat_y", "quat_z"), walk.quat_wxyz.T, strict=True))
+    columns |= dict(zip(("vel_x", "vel_y", "vel_z"), walk.vel.T, strict=True))
+    return pl.DataFrame(columns | {"still": (~walk.walking).astype(np.int8)})
+
+
+def _facts(walk: PhoneWalk, format: str) -> dict[str, Any]:
+    chosen = msgspec.to_builtins(walk.options)
+    return {
+        "closed": walk.closed,
+        **({"length_m": round(walk.length_m, 6)} if walk.length_m else {}),
+        "steps": walk.steps.height,
+        "scenario": walk.scenario,
+        "seed": walk.seed,
+        "format": format,
+        "frame": "x east, y true north, z up, origin on the ground at the start; quat = rot_nb of the phone",
+        "declination_deg": round(float(np.degrees(walk.declination_rad)), 4),
+        "hard_iron_t": walk.hard_iron_t.tolist(),
+        "options": {k: v for k, v in chosen.items() if v is not None},
+    }
