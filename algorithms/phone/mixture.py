@@ -1,0 +1,268 @@
+"""The track as a mixture of Gaussian hypotheses: steps carry it, fixes weigh and correct it.
+
+State of a hypothesis: position east, north (m), heading correction (rad, added to the steps' headings),
+logarithm of the length's scale, the slow error of the fixes (m), a Gauss–Markov process, and the rate at which
+the headings drift (rad/s: the gyroscope's bias about the vertical). An unknown initial
+heading is a ring of hypotheses, not a linearization. A fix is an inlier or an outlier with stated
+probabilities; each hypothesis is corrected by its inlier's share (probabilistic data association, Bar-Shalom), so
+that a fix far off moves nothing and a doubtful one a little, with the covariance to match.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from ..numerics.compiled import compiled, inlined
+from .attitude import wrap
+
+N = 7
+HYPOTHESES = 12
+
+FIELDS: list[tuple[Any, ...]] = [
+    ("hyp", "i8"),  # number of hypotheses that are alive
+    ("hx", "f8", (HYPOTHESES, N)),
+    ("hP", "f8", (HYPOTHESES, N, N)),
+    ("hw", "f8", (HYPOTHESES,)),
+    ("work", "f8", (2, N)),
+    ("located", "i8"),
+    ("moved_ns", "i8"),
+    ("q_length", "f8"),  # relative standard deviation of a step's length
+    ("q_heading", "f8"),  # standard deviation of a step's heading (rad)
+    ("q_turn", "f8"),  # growth of the heading's error, rad per √step
+    ("q_scale", "f8"),  # growth of the scale's error, per √step
+    ("q_drift", "f8"),  # growth of the drift, rad/s per √s
+    ("gm_share", "f8"),  # share of the slow error in a fix's variance
+    ("gm_tau", "f8"),
+    ("gm_sd", "f8"),  # stationary standard deviation of the slow error now modelled (m)
+    ("outlier", "f8"),
+    ("mean", "f8", (4,)),  # mixture: east, north, heading correction, scale
+    ("cov", "f8", (4,)),  # east, east-north, north; variance of the heading correction
+    ("fixes", "i8"),
+    ("outliers", "f8"),
+]
+
+
+def configure(
+    s: Any, *, heading_known: bool, sigma_heading: float, sigma_scale: float, sigma_drift: float
+) -> None:
+    """Start the hypotheses in record ``s``: one where the heading is known, else a ring of them."""
+    count = 1 if heading_known else HYPOTHESES
+    s["hyp"] = count
+    for h in range(count):
+        turn = 2 * math.pi * h / count
+        s["hx"][h, 2] = turn - 2 * math.pi if turn > math.pi else turn
+        s["hP"][h, 2, 2] = sigma_heading**2 if heading_known else (math.pi / count) ** 2
+        s["hP"][h, 3, 3] = sigma_scale**2
+        s["hP"][h, 6, 6] = sigma_drift**2
+        s["hw"][h] = 1.0 / count
+
+
+def weigh(s: Any, center: float, sigma: float, share: float) -> None:
+    """Weigh the ring by a heading known to ``sigma`` about ``center``, wrong altogether with ``share``."""
+    total = 0.0
+    for h in range(HYPOTHESES):
+        d = wrap(s["hx"][h, 2] - center)
+        s["hw"][h] = share / HYPOTHESES + (1 - share) * math.exp(-0.5 * (d / sigma) ** 2)
+        total += s["hw"][h]
+    s["hw"][:HYPOTHESES] /= total
+
+
+@compiled
+def step(s: Any, t_ns: int, length: float, heading: float, share: float) -> None:
+    """Move all hypotheses by ``share`` of a step (length in m, heading in rad)."""
+    age(s, t_ns)
+    for h in range(s.hyp):
+        d = s.hx[h, 2]
+        r = length * share * math.exp(s.hx[h, 3])
+        c, w = math.cos(heading + d), math.sin(heading + d)
+        s.hx[h, 0] += r * c
+        s.hx[h, 1] += r * w
+        # P ← F P Fᵀ, rows then columns; F has −r w, r c for the heading and r c, r w for the scale.
+        for j in range(N):
+            a, b = s.hP[h, 2, j], s.hP[h, 3, j]
+            s.hP[h, 0, j] += -r * w * a + r * c * b
+            s.hP[h, 1, j] += r * c * a + r * w * b
+        for i in range(N):
+            a, b = s.hP[h, i, 2], s.hP[h, i, 3]
+            s.hP[h, i, 0] += -r * w * a + r * c * b
+            s.hP[h, i, 1] += r * c * a + r * w * b
+        along, across = (s.q_length * r) ** 2 / share, (s.q_heading * r) ** 2 / share
+        s.hP[h, 0, 0] += along * c * c + across * w * w
+        s.hP[h, 1, 1] += along * w * w + across * c * c
+        s.hP[h, 0, 1] += (along - across) * c * w
+        s.hP[h, 1, 0] = s.hP[h, 0, 1]
+        s.hP[h, 2, 2] += share * s.q_turn**2
+        s.hP[h, 3, 3] += share * s.q_scale**2
+    summarize(s)
+
+
+@compiled
+def age(s: Any, t_ns: int) -> None:
+    """Let the headings drift and the fixes' slow error fade since the last event."""
+    dt = (t_ns - s.moved_ns) * 1e-9 if s.moved_ns != 0 else 0.0
+    s.moved_ns = max(t_ns, s.moved_ns)
+    if dt <= 0.0:
+        return
+    for h in range(s.hyp):
+        s.hx[h, 2] += s.hx[h, 6] * dt
+        for j in range(N):
+            s.hP[h, 2, j] += dt * s.hP[h, 6, j]
+        for j in range(N):
+            s.hP[h, j, 2] += dt * s.hP[h, j, 6]
+        s.hP[h, 6, 6] += dt * s.q_drift**2
+    if s.gm_sd == 0.0:
+        return
+    keep = math.exp(-dt / s.gm_tau)
+    add = s.gm_sd**2 * (1.0 - keep * keep)
+    for h in range(s.hyp):
+        for i in range(4, 6):
+            s.hx[h, i] *= keep
+            for j in range(N):
+                s.hP[h, i, j] *= keep
+            for j in range(N):
+                s.hP[h, j, i] *= keep
+            s.hP[h, i, i] += add
+
+
+@compiled
+def fix(s: Any, t_ns: int, east: float, north: float, sd: float) -> None:
+    """Take a fix (m) whose stated standard deviation an axis is ``sd`` (m)."""
+    age(s, t_ns)
+    s.fixes += 1
+    slow, white = sd * math.sqrt(s.gm_share), sd * sd * (1.0 - s.gm_share)
+    if s.gm_sd == 0.0 or s.located == 0:
+        for h in range(s.hyp):
+            for i in range(4, 6):
+                s.hP[h, i, i] = slow * slow
+    s.gm_sd = slow if s.located == 0 else s.gm_sd + 0.2 * (slow - s.gm_sd)
+    if s.located == 0:
+        s.located = 1
+        for h in range(s.hyp):  # the walked way so far is about an unknown origin
+            s.hP[h, 0, 0] += 1e8
+            s.hP[h, 1, 1] += 1e8
+        for h in range(s.hyp):
+            _correct(s, h, east, north, white, 1.0)
+        summarize(s)
+        return
+    total, outside = 0.0, 0.0
+    for h in range(s.hyp):
+        p_in, p_out = _likelihoods(s, h, east, north, white)
+        share = (1.0 - s.outlier) * p_in / ((1.0 - s.outlier) * p_in + s.outlier * p_out)
+        s.hw[h] *= (1.0 - s.outlier) * p_in + s.outlier * p_out
+        total += s.hw[h]
+        outside += s.hw[h] * (1.0 - share)
+        _correct(s, h, east, north, white, share)
+    s.outliers += outside / total if total > 0.0 else 1.0
+    for h in range(s.hyp):
+        s.hw[h] = s.hw[h] / total if total > 0.0 else 1.0 / s.hyp
+    _prune(s)
+    summarize(s)
+
+
+@compiled
+def _innovation(s: Any, h: int, white: float) -> tuple[float, float, float]:
+    a = s.hP[h, 0, 0] + 2.0 * s.hP[h, 0, 4] + s.hP[h, 4, 4] + white
+    b = s.hP[h, 0, 1] + s.hP[h, 0, 5] + s.hP[h, 4, 1] + s.hP[h, 4, 5]
+    c = s.hP[h, 1, 1] + 2.0 * s.hP[h, 1, 5] + s.hP[h, 5, 5] + white
+    return a, b, c
+
+
+@inlined
+def _density(x: float, y: float, a: float, b: float, c: float) -> float:
+    det = a * c - b * b
+    m = (c * x * x - 2.0 * b * x * y + a * y * y) / det
+    return math.exp(-0.5 * m) / (2.0 * math.pi * math.sqrt(det))
+
+
+@compiled
+def _likelihoods(s: Any, h: int, east: float, north: float, white: float) -> tuple[float, float]:
+    """Densities of a fix as inlier, and as outlier (the same with 50 m more an axis)."""
+    x, y = east - s.hx[h, 0] - s.hx[h, 4], north - s.hx[h, 1] - s.hx[h, 5]
+    a, b, c = _innovation(s, h, white)
+    return _density(x, y, a, b, c), _density(x, y, a + 2500.0, b, c + 2500.0) + 1e-30
+
+
+@compiled
+def _correct(s: Any, h: int, east: float, north: float, white: float, share: float) -> None:
+    """Kalman update by the inlier's share β: x + β K ν, P − β K S Kᵀ + β (1 − β) K ν νᵀ Kᵀ."""
+    x, y = east - s.hx[h, 0] - s.hx[h, 4], north - s.hx[h, 1] - s.hx[h, 5]
+    a, b, c = _innovation(s, h, white)
+    det = a * c - b * b
+    for i in range(N):
+        u, v = s.hP[h, i, 0] + s.hP[h, i, 4], s.hP[h, i, 1] + s.hP[h, i, 5]
+        s.work[0, i], s.work[1, i] = (u * c - v * b) / det, (v * a - u * b) / det
+    for i in range(N):
+        s.hx[h, i] += share * (s.work[0, i] * x + s.work[1, i] * y)
+    for i in range(N):
+        ki, li = s.work[0, i], s.work[1, i]
+        for j in range(i, N):
+            kj, lj = s.work[0, j], s.work[1, j]
+            taken = ki * (a * kj + b * lj) + li * (b * kj + c * lj)
+            spread = (ki * x + li * y) * (kj * x + lj * y)
+            s.hP[h, i, j] += share * ((1.0 - share) * spread - taken)
+            s.hP[h, j, i] = s.hP[h, i, j]
+    s.hx[h, 2] = wrap(s.hx[h, 2])
+    s.hx[h, 3] = min(max(s.hx[h, 3], -0.7), 0.7)
+
+
+@compiled
+def _prune(s: Any) -> None:
+    """Drop hypotheses below 1e-5, and the lighter of two that have become the same."""
+    kept = 0
+    for h in range(s.hyp):
+        keep = s.hw[h] > 1e-5
+        for g in range(kept):
+            if keep:
+                d = wrap(s.hx[h, 2] - s.hx[g, 2])
+                if d * d < 0.05 * s.hP[g, 2, 2] and abs(s.hx[h, 0] - s.hx[g, 0]) + abs(
+                    s.hx[h, 1] - s.hx[g, 1]
+                ) < 0.2 * math.sqrt(s.hP[g, 0, 0] + s.hP[g, 1, 1]):
+                    if s.hw[h] > s.hw[g]:
+                        weight = s.hw[g] + s.hw[h]
+                        _copy(s, h, g)
+                        s.hw[g] = weight
+                    else:
+                        s.hw[g] += s.hw[h]
+                    keep = False
+        if keep:
+            if kept != h:
+                _copy(s, h, kept)
+            kept += 1
+    s.hyp = max(kept, 1)
+    total = 0.0
+    for h in range(s.hyp):
+        total += s.hw[h]
+    for h in range(s.hyp):
+        s.hw[h] /= total
+
+
+@inlined
+def _copy(s: Any, a: int, b: int) -> None:
+    s.hw[b] = s.hw[a]
+    for i in range(N):
+        s.hx[b, i] = s.hx[a, i]
+        for j in range(N):
+            s.hP[b, i, j] = s.hP[a, i, j]
+
+
+@compiled
+def summarize(s: Any) -> None:
+    """Write mean and covariance of the mixture."""
+    x, y, c, w, k = 0.0, 0.0, 0.0, 0.0, 0.0
+    for h in range(s.hyp):
+        x += s.hw[h] * s.hx[h, 0]
+        y += s.hw[h] * s.hx[h, 1]
+        c += s.hw[h] * math.cos(s.hx[h, 2])
+        w += s.hw[h] * math.sin(s.hx[h, 2])
+        k += s.hw[h] * s.hx[h, 3]
+    turn = math.atan2(w, c)
+    xx, xy, yy, tt = 0.0, 0.0, 0.0, 0.0
+    for h in range(s.hyp):
+        dx, dy, dt = s.hx[h, 0] - x, s.hx[h, 1] - y, wrap(s.hx[h, 2] - turn)
+        xx += s.hw[h] * (s.hP[h, 0, 0] + dx * dx)
+        xy += s.hw[h] * (s.hP[h, 0, 1] + dx * dy)
+        yy += s.hw[h] * (s.hP[h, 1, 1] + dy * dy)
+        tt += s.hw[h] * (s.hP[h, 2, 2] + dt * dt)
+    s.mean[0], s.mean[1], s.mean[2], s.mean[3] = x, y, turn, k
+    s.cov[0], s.cov[1], s.cov[2], s.cov[3] = xx, xy, yy, tt

@@ -1,0 +1,309 @@
+"""The kernel behind ``phone.pdr``, ``phone.pdr-source`` and ``phone.fused``: from messages to a track.
+
+Every accelerometer sample goes to the attitude, the ring and the step detector. A step that is found gets its
+length and heading from its own samples and moves the track. A fix waits until the steps up to its time are
+known and is then taken between them, a step that it falls into being divided.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from ..numerics.compiled import compiled
+from . import attitude, direction, geodesy, lengths, mixture, ring, steps
+
+GYR, ACC, MAG, PRESSURE, GNSS = range(5)
+"""Roles of inputs."""
+WAITING = 32
+EVENTS = 16
+"""Steps and fixes that one message is answered with at most; what is more follows with the next."""
+
+FIELDS: list[tuple[Any, ...]] = [
+    *steps.FIELDS,
+    *attitude.FIELDS,
+    *direction.FIELDS,
+    *lengths.FIELDS,
+    *geodesy.ORIGIN,
+    *mixture.FIELDS,
+    ("role", "i8", (5,)),
+    ("fused", "i8"),
+    ("has_gyr", "i8"),
+    ("mag_prior", "f8", (2,)),  # sigma and share of wrong of the first magnetic heading; 0 none
+    ("turned", "f8"),  # heading of the first step, where north is unknown (subtracted)
+    ("first_step", "i8"),
+    ("heading", "f8"),
+    ("distance", "f8"),
+    ("waiting", "i8"),
+    ("wait_ns", "i8", (WAITING,)),
+    ("wait", "f8", (WAITING, 5)),  # latitude, longitude (rad), height, deviation (m), declination (rad)
+    ("part", "f8"),  # share of the first step in the queue that has been walked
+    ("part_on", "i8"),
+    ("part_length", "f8"),
+    ("part_heading", "f8"),
+    ("lost_fixes", "i8"),
+    ("far_fixes", "i8"),
+    ("relocated", "i8"),
+    ("sd_default", "f8"),
+    ("sd_min", "f8"),
+    # Height
+    ("pressure_n", "i8"),
+    ("pressure_ns", "i8"),
+    ("pressure_zero", "f8"),
+    ("pressure_begin_ns", "i8"),
+    ("height", "f8"),
+    ("height_step", "f8"),
+    ("alt_n", "f8"),
+    ("alt_zero", "f8"),
+]
+
+# Columns of the result vector: step, pose, sigma, heading, detector, and of fused fix and state.
+O_STEP, O_POSE, O_SIGMA, O_HEADING, O_DETECTOR = 0, 5, 12, 18, 23
+O_FIX = O_DETECTOR + ring.N_FEATURES
+O_STATE = O_FIX + 6
+WIDTH_PDR, WIDTH_FUSED = O_FIX, O_STATE + 6
+
+
+@compiled
+def take(s: Any, role: int, t_ns: int, v: Any) -> None:
+    """Take one message."""
+    if role == GYR:
+        attitude.take_gyr(s, t_ns, v[0], v[1], v[2])
+        direction.take_gyr(s, t_ns, v[2])
+    elif role == ACC:
+        attitude.take_acc(s, v[0], v[1], v[2])
+        i = steps.take(s, t_ns, v[0], v[1], v[2])
+        direction.describe(s, i, t_ns, v[0], v[1], v[2])
+    elif role == MAG:
+        for j in range(3):
+            s.raw_mag[j] = v[j]
+        attitude.take_mag(s, t_ns, v[0], v[1], v[2])
+    elif role == PRESSURE:
+        _take_pressure(s, t_ns, v[0])
+    elif math.isfinite(v[0]) and math.isfinite(v[1]):
+        if s.waiting >= WAITING:
+            s.lost_fixes += 1
+            return
+        s.wait_ns[s.waiting] = t_ns
+        for j in range(5):
+            s.wait[s.waiting, j] = v[j]
+        s.waiting += 1
+
+
+@compiled
+def _take_pressure(s: Any, t_ns: int, pascal: float) -> None:
+    """Height above the first seconds' (m) by the standard atmosphere, over 1 s."""
+    if not pascal > 1000.0:
+        return
+    if s.pressure_n == 0:
+        s.pressure_begin_ns = t_ns
+    dt = (t_ns - s.pressure_ns) * 1e-9 if s.pressure_n > 0 else 0.0
+    s.pressure_n += 1
+    if t_ns - s.pressure_begin_ns < 2_000_000_000:
+        s.pressure_zero += (pascal - s.pressure_zero) / s.pressure_n
+    up = 44330.77 * (1.0 - (pascal / s.pressure_zero) ** 0.190263)
+    if s.pressure_n > 1:
+        s.height += (1.0 - math.exp(-dt)) * (up - s.height)
+    s.pressure_ns = t_ns
+
+
+@compiled
+def _open_step(s: Any) -> None:
+    """Give the first step of the queue its length and heading."""
+    start, end = s.queue_start[0], s.queue_end[0]
+    ring.features(s, start, end, s.gravity, s.features)
+    length = lengths.length_of(s, s.features)
+    if s.offset_n == 0:
+        direction.look_ahead(s)
+    heading = direction.heading_of(s, start, end)
+    if not math.isfinite(length):
+        length = 0.0
+    if not math.isfinite(heading):
+        heading = s.part_heading
+    elif s.first_step == 0:
+        s.first_step = 1
+        if s.tau_mag > 1e4:  # an uncalibrated field says where north is once, and then bends nothing
+            s.mag_gain = 0.0
+        # Where north is unknown the first step's direction is x.
+        s.turned = heading if s.has_mag == 0 and s.mode < direction.MAGNETOMETER else 0.0
+        if s.mode == direction.GYROSCOPE:
+            s.turned = heading
+        heading = attitude.wrap(heading - s.turned)
+    else:
+        heading = attitude.wrap(heading - s.turned)
+    s.part_on, s.part = 1, 0.0
+    s.part_length, s.part_heading = length, heading
+
+
+@compiled
+def _write_track(s: Any, t_ns: int, at: int, out_message: Any, out_t_ns: Any, out: Any, k: int) -> None:
+    for j in range(out.shape[1]):
+        out[k, j] = np.nan
+    out_message[k], out_t_ns[k] = at, t_ns
+    heading = attitude.wrap(s.part_heading + s.mean[2])
+    s.heading = heading
+    out[k, O_POSE], out[k, O_POSE + 1], out[k, O_POSE + 2] = s.mean[0], s.mean[1], s.height
+    out[k, O_POSE + 3], out[k, O_POSE + 4] = math.cos(0.5 * heading), 0.0
+    out[k, O_POSE + 5], out[k, O_POSE + 6] = 0.0, math.sin(0.5 * heading)
+    out[k, O_SIGMA], out[k, O_SIGMA + 1] = math.sqrt(s.cov[0]), math.sqrt(s.cov[2])
+    if s.pressure_n > 0:  # weather: about 0.03 m per root second
+        out[k, O_SIGMA + 2] = math.sqrt(0.09 + 0.0009 * (t_ns - s.pressure_begin_ns) * 1e-9)
+    out[k, O_SIGMA + 5] = min(math.sqrt(s.cov[3]), math.pi)
+    if s.fused == 1 and s.located == 1:
+        lat, lon, _alt = geodesy.from_enu(s, s.mean[0], s.mean[1], 0.0)
+        out[k, O_FIX], out[k, O_FIX + 1] = math.degrees(lat), math.degrees(lon)
+        if s.alt_n > 0:
+            out[k, O_FIX + 2] = s.alt_zero + s.height
+            out[k, O_FIX + 5] = 10.0
+        out[k, O_FIX + 3], out[k, O_FIX + 4] = out[k, O_SIGMA], out[k, O_SIGMA + 1]
+    if s.fused == 1:
+        out[k, O_STATE], out[k, O_STATE + 1] = s.mean[2], math.exp(s.mean[3])
+        out[k, O_STATE + 2] = s.hyp
+        out[k, O_STATE + 3] = s.cov[1] / math.sqrt(max(s.cov[0] * s.cov[2], 1e-12))
+        out[k, O_STATE + 4], out[k, O_STATE + 5] = s.fixes, s.outliers
+
+
+@compiled
+def _close_step(s: Any, at: int, out_message: Any, out_t_ns: Any, out: Any, k: int) -> None:
+    start, end = s.queue_start[0], s.queue_end[0]
+    mixture.step(s, end, s.part_length, s.part_heading, 1.0 - s.part)
+    length = s.part_length * math.exp(s.mean[3])
+    s.distance += length
+    _write_track(s, end, at, out_message, out_t_ns, out, k)
+    out[k, O_STEP], out[k, O_STEP + 1], out[k, O_STEP + 2] = (end - start) * 1e-9, s.steps, length
+    out[k, O_STEP + 3] = s.height - s.height_step if s.pressure_n > 0 else np.nan
+    out[k, O_STEP + 4] = s.heading
+    s.height_step = s.height
+    last = (ring.first_after(s, end) - 1) % ring.RING
+    out[k, O_HEADING] = s.ring[last, ring.YAW]
+    out[k, O_HEADING + 1] = s.heading
+    out[k, O_HEADING + 2] = s.ring[last, ring.MAG_YAW] if s.mag_n > 0 else np.nan
+    out[k, O_HEADING + 3] = s.ring[last, ring.DISTURBED]
+    out[k, O_HEADING + 4] = s.offset
+    for j in range(ring.N_FEATURES):
+        out[k, O_DETECTOR + j] = s.features[j]
+    s.steps += 1
+    s.part_on = 0
+    steps.shift_queue(s, 1)
+
+
+@compiled
+def _use_fix(s: Any, t_ns: int) -> None:
+    """Take the first waiting fix into the mixture."""
+    lat, lon, alt, sd = s.wait[0, 0], s.wait[0, 1], s.wait[0, 2], s.wait[0, 3]
+    turn = s.wait[0, 4]
+    for k in range(1, s.waiting):
+        s.wait_ns[k - 1] = s.wait_ns[k]
+        for j in range(5):
+            s.wait[k - 1, j] = s.wait[k, j]
+    s.waiting -= 1
+    sd = max(sd, s.sd_min) if math.isfinite(sd) and sd > 0.0 else s.sd_default
+    if s.origin_set == 0:
+        geodesy.set_origin(s, lat, lon, alt if math.isfinite(alt) else 0.0)
+        if s.has_mag == 1 and math.isfinite(turn):
+            _decline(s, turn)
+    e, n, _ = geodesy.to_enu(s, lat, lon, s.alt_zero if s.alt_n > 0 else (alt if math.isfinite(alt) else 0.0))
+    if math.isfinite(alt):
+        s.alt_n += 1.0
+        s.alt_zero += (alt - s.height - s.alt_zero) / min(s.alt_n, 200.0)
+    before = s.outliers
+    mixture.fix(s, t_ns, e, n, sd)
+    s.far_fixes = s.far_fixes + 1 if s.outliers - before > 0.9 else 0
+    if s.far_fixes >= 10:  # ten in a row: it is the track that is wrong
+        s.far_fixes, s.relocated = 0, s.relocated + 1
+        s.hyp = mixture.HYPOTHESES
+        for h in range(s.hyp):
+            for i in range(mixture.N):
+                s.hx[h, i] = 0.0
+                for j in range(mixture.N):
+                    s.hP[h, i, j] = 0.0
+            s.hx[h, 2] = attitude.wrap(2.0 * math.pi * h / s.hyp)
+            s.hP[h, 2, 2], s.hP[h, 3, 3] = (math.pi / s.hyp) ** 2, 0.01
+            s.hP[h, 6, 6] = 1e-5
+            s.hw[h] = 1.0 / s.hyp
+        s.located = 0
+        mixture.fix(s, t_ns, e, n, sd)
+
+
+@compiled
+def _decline(s: Any, turn: float) -> None:
+    """Turn everything so far from magnetic to true north, now that the place is known."""
+    change = turn - s.declination
+    s.declination = turn
+    c, w = math.cos(-change), math.sin(-change)
+    for h in range(s.hyp):
+        x, y = s.hx[h, 0], s.hx[h, 1]
+        s.hx[h, 0], s.hx[h, 1] = c * x - w * y, w * x + c * y
+    s.part_heading -= change
+    for k in range(max(0, s.taken - ring.RING), s.taken):
+        s.ring[k % ring.RING, ring.YAW] -= change
+
+
+@compiled
+def drain(
+    s: Any,
+    now_ns: int,
+    all_of_it: bool,
+    at: int,
+    out_message: Any,
+    out_t_ns: Any,
+    out: Any,
+    count: int,
+    room: int,
+) -> int:
+    """Process what is known by now, in the order of its times."""
+    while room > 0:
+        if s.queued > 0:
+            if s.part_on == 0:
+                _open_step(s)
+            start, end = s.queue_start[0], s.queue_end[0]
+            if s.waiting > 0 and s.wait_ns[0] <= end:
+                t = s.wait_ns[0]
+                share = min(max((t - start) / max(end - start, 1), s.part), 1.0)
+                if share > s.part:
+                    mixture.step(s, t, s.part_length, s.part_heading, share - s.part)
+                    s.part = share
+            else:
+                if s.part < 1.0:
+                    _close_step(s, at, out_message, out_t_ns, out, count)
+                else:
+                    s.part = 1.0 - 1e-9
+                    continue
+                count, room = count + 1, room - 1
+                continue
+        elif s.waiting > 0:
+            # No step is known yet that could cover the fix.
+            hold = 5.0 if s.run_n > 0 and s.walking == 0 and s.local == 0 else 2.4
+            if not all_of_it and s.waiting < WAITING - 2 and (now_ns - s.wait_ns[0]) * 1e-9 < hold:
+                break
+        else:
+            break
+        t = s.wait_ns[0]
+        _use_fix(s, t)
+        _write_track(s, t, at, out_message, out_t_ns, out, count)
+        count, room = count + 1, room - 1
+    return count
+
+
+@compiled
+def run(
+    state: Any, inputs: Any, channels: Any, t_ns: Any, values: Any, out_message: Any, out_t_ns: Any, out: Any
+) -> int:
+    """Take messages; see :class:`..contract.KernelEstimator`."""
+    s, count = state[0], 0
+    for i in range(t_ns.shape[0]):
+        take(s, s.role[inputs[i]], t_ns[i], values[i])
+        if s.queued > 0 or s.waiting > 0:
+            count = drain(s, t_ns[i], False, i, out_message, out_t_ns, out, count, EVENTS)
+    return count
+
+
+@compiled
+def run_end(state: Any, out_t_ns: Any, out: Any) -> int:
+    """Give what is still held back."""
+    s = state[0]
+    if s.local == 0:
+        steps.cells.settle(s)
+    return drain(s, 0, True, 0, out_t_ns, out_t_ns, out, 0, ring.QUEUE + WAITING)
