@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
+from .annotations import TOPIC
 from .errors import Finding
 from .integrity import structure
 
@@ -128,6 +129,8 @@ class _Watch:
             limit = f"longer than {self.limit_s:.3g} s"
             yield from said("gap", self.gap, f"pauses {limit}, the longest lasts {self.gap.worst:.6g} s")
         for name, tally in self.missing.items():
+            if self.channel.topic.startswith(TOPIC):
+                continue  # an annotation need not state its confidence
             yield from said("missing_cell", tally, f"{name} has no value")
         for sensor in dict.fromkeys(name[:-2] for name in self.nonzero if name[:-2] in ("acc", "gyr", "mag")):
             axes = [name for name in self.nonzero if name[:-2] == sensor]

@@ -92,7 +92,7 @@ def test_unknown_preset_lists_what_there_is() -> None:
     ("params", "said"),
     [
         ({"sigma_acc": -1}, "sigma_acc = -1 is not allowed; must be float ≥ 0 (m/s²)"),
-        ({"detector": "zupt"}, "are, c1c2c3, mag, mv, pitch, shoe"),
+        ({"detector": "zupt"}, "are, c1c2c3, gait, mag, mv, pitch, shoe"),
         ({"gravity": "much"}, "gravity = 'much'"),
         ({"gravity": float("nan")}, "gravity = nan"),
         ({"c3_max": float("inf")}, "c3_max = inf"),
