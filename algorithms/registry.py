@@ -50,7 +50,7 @@ def find(name: str, group: str = GROUP) -> Any:
     raise AlgorithmError(f"no {kind} {name!r}; available: {_names(available(group))}")
 
 
-def make(name: str, /, *, preset: str | None = None, **params: Any) -> PlainEstimator:
+def make(name: str, /, *, preset: str | None = None, **params: Any) -> Any:
     """Build the estimator ``name``.
 
     Parameters

@@ -243,7 +243,10 @@ def _correction(steps: Sequence[tuple[tuple[str, ...], FloatArray, FloatArray]])
         for columns, matrix, offset in steps:
             values = table.select(columns).to_numpy() - offset
             # one by one: a matrix product of BLAS may round otherwise for another number of rows
-            corrected = [sum(matrix[i, j] * values[:, j] for j in range(3)) for i in range(3)]
+            corrected = [
+                matrix[i, 0] * values[:, 0] + matrix[i, 1] * values[:, 1] + matrix[i, 2] * values[:, 2]
+                for i in range(3)
+            ]
             table = table.with_columns(pl.Series(c, v) for c, v in zip(columns, corrected, strict=True))
         return table
 

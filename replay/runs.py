@@ -403,7 +403,8 @@ class MessageRunner(Runner):
             n = len(t_ns)
             columns = np.ascontiguousarray(values.T)
             return self._by_output(columns, t_ns, np.full(n, state.last_log_ns), np.full(n, key)) if n else {}
-        found = list(self.estimator.finish() or ())
+        held: Iterable[Result] = self.estimator.finish() or ()
+        found = list(held)
         self.loop_s += time.perf_counter() - begin
         return self._blocks_of(found, [0] * len(found), np.array([state.last_log_ns]), np.array([key]))
 

@@ -11,7 +11,6 @@ import queue
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -75,9 +74,21 @@ class Source(Protocol):
     seekable: bool
     start_ns: int
     end_ns: int
-    metadata: Mapping[str, Mapping[str, str]]
-    attachments: Mapping[str, bytes]
-    static: Mapping[str, pl.DataFrame]
+
+    @property
+    def metadata(self) -> Mapping[str, Mapping[str, str]]:
+        """Metadata records by name."""
+        ...
+
+    @property
+    def attachments(self) -> Mapping[str, bytes]:
+        """Attachments by name, read when asked for."""
+        ...
+
+    @property
+    def static(self) -> Mapping[str, pl.DataFrame]:
+        """Static channels (frames) by topic."""
+        ...
 
     def rate_hz(self, topic: str) -> float:
         """Return the channel's measured or declared rate in hertz, 0 where it is not known."""
@@ -162,7 +173,7 @@ class RecordingSource:
         self.attachments = _Attachments(recording)
         self._rates: dict[str, float] = {}
 
-    @cached_property
+    @property
     def static(self) -> dict[str, pl.DataFrame]:
         """Static frames by topic."""
         return {t: self.recording.table(t) for t in self.channels if t.endswith("_static")}

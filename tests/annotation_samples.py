@@ -44,7 +44,7 @@ def recording(path: Path) -> Path:
     return path
 
 
-def annotations(count: int, seed: int = 1) -> pl.DataFrame:
+def hard_annotations(count: int, seed: int = 1) -> pl.DataFrame:
     """Return annotations of five tiers: instants, intervals from 1 ns to 5 s, overlaps, every script."""
     rng = random.Random(seed)
     rows = []

@@ -48,7 +48,8 @@ def test_equals_the_textbook_recursion() -> None:
     estimator: Any = make("foot.rts", **PARAMS)
     out = np.empty((len(rows), estimator.width))
     logs = np.zeros(len(rows), f.LOG)
-    f.forward(*estimator.views(estimator.state.copy()), rows, out, logs)
+    forward: Any = f.forward
+    forward(*estimator.views(estimator.state.copy()), rows, out, logs)
     smoothed = smooth(rows, **PARAMS)
 
     first = int(np.flatnonzero(logs["stage"] == f.START)[0])

@@ -20,7 +20,7 @@ from marcha.recording.changes import change
 from pympi.Elan import Eaf
 from pympi.Praat import TextGrid
 
-from .annotation_samples import START_NS, annotations, recording
+from .annotation_samples import START_NS, hard_annotations, recording
 
 COUNT = 3_000
 RESOLUTION = {"audacity": 1_000, "eaf": 1_000_000, "textgrid": 1}
@@ -30,7 +30,7 @@ RESOLUTION = {"audacity": 1_000, "eaf": 1_000_000, "textgrid": 1}
 def rec(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     folder = tmp_path_factory.mktemp("labels")
     rec = mr.open(recording(folder / "raw.mcap"))
-    change(rec, folder / "a.mcap", add=annotations(COUNT))
+    change(rec, folder / "a.mcap", add=hard_annotations(COUNT))
     return mr.open(folder / "a.mcap")
 
 

@@ -68,7 +68,7 @@ def test_anchors_beyond_the_reach_are_left_out_before_the_correction():
     near = np.linalg.norm(FLOOR - [10.0, 4.0], axis=1) <= 9.0
     assert 0 < near.sum() < 6
     assert set(found["ranges"]["mac"]) == {m for m, n in zip(MACS, near, strict=True) if n}
-    assert found["ranges"]["distance_m"].max() <= 9.0
+    assert found["ranges"]["distance_m"].to_numpy().max() <= 9.0
 
 
 @pytest.mark.parametrize(("keep", "kind"), [((0, 2), "too_few_anchors"), ((0, 1), "too_few_anchors")])
@@ -124,6 +124,7 @@ def test_the_particle_filter_gives_the_same_bits_in_blocks_and_after_a_restore()
     rows = []
     for first, last in ((0, 70), (70, 71), (71, 200)):
         saved = other.snapshot()
+        count, out = 0, np.empty((0, 6))
         for again in range(2):  # the second time after a restore
             if again:
                 other.restore(saved)
@@ -202,7 +203,7 @@ def test_calibration_finds_the_model_and_says_what_is_pooled():
 )
 def test_steady_gains(r, q, gain):
     assert steady_gain(r, q) == pytest.approx(gain, abs=1e-3)
-    variance = 1.0
+    variance, k = 1.0, 0.0
     for _ in range(500):
         k = (variance + q) / (variance + q + r)
         variance = (1 - k) * (variance + q)

@@ -14,7 +14,7 @@ from marcha.recording import MarchaError, Recording, UsageError
 from marcha.recording.changes import change, edit, find, history, standing, undo
 from marcha.recording.events import SIDECAR, TABLE, Vocabulary
 
-from .annotation_samples import START_NS, annotations, recording
+from .annotation_samples import START_NS, hard_annotations, recording
 
 WHEN = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
 
@@ -98,7 +98,7 @@ def test_any_session_is_undone_to_nothing(tmp_path_factory: pytest.TempPathFacto
 
 def test_readings_stay_and_the_events_are_attached(rec: Recording) -> None:
     before = rec.table("/imu")
-    rec = changed(rec, add=annotations(50))
+    rec = changed(rec, add=hard_annotations(50))
     assert rec.table("/imu").equals(before)
     assert {TABLE, SIDECAR} <= {a.name for a in rec.attachments}
     assert rec.attachment(TABLE).count(b"\t") >= 50 * 11

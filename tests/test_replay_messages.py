@@ -329,7 +329,7 @@ def chained(tables: dict[str, pl.DataFrame]) -> dict[str, pl.DataFrame]:
 
 def chain_oracle(imu: pl.DataFrame) -> list[tuple]:
     """Feed every sample to the first stage, what it says to the second, one after another."""
-    peaks, walk, rows = Peaks(), Walk(), []
+    peaks, walk, rows, log = Peaks(), Walk(), [], 0
     for t_ns, log, x, _, z in imu.rows():
         message = Message("imu", t_ns, (z,), log, "/p/imu")
         steps = [r for r in peaks.take(message) if r.output == "step"]

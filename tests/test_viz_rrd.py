@@ -214,7 +214,7 @@ def test_lanes_hold_only_the_changes_and_end_with_the_recording(folder: Path, do
     np.testing.assert_array_equal(t_ns[:-1], still["t_ns"].to_numpy()[change] - START)
     assert state[:2, 0].tolist() == ["still", "moving"]
     assert state[-1, 0] == ""
-    assert t_ns[-1] == done.table("/foot/imu1")["t_ns"].max() - START
+    assert t_ns[-1] == done.table("/foot/imu1")["t_ns"].to_numpy().max() - START
 
 
 def test_thresholds_are_lines_on_the_statistic_and_on_the_raw_norm(folder: Path, done: mr.Recording) -> None:

@@ -222,7 +222,7 @@ class Count(View):
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
         values = self.count + 1.0 + np.arange(len(t_ns))
         self.count += len(t_ns)
-        self.canvas.scalars(f"{self.path}/count", t_ns, values)
+        self.canvas.scalars(f"{self.path}/count", t_ns, np.asarray(values, np.float64))
 
 
 class Broken(Breath):
@@ -436,8 +436,9 @@ def test_a_plan_in_degrees_is_laid_out_in_metres() -> None:
     (line,) = floor_plan({"plan.geojson": lambda: json.dumps(shape).encode()}).outlines
     from pyproj import Geod
 
-    _, _, east = Geod(ellps="WGS84").inv(*ring[0], *ring[1])
-    _, _, north = Geod(ellps="WGS84").inv(*ring[1], *ring[2])
+    earth = Geod(ellps="WGS84")
+    _, _, east = earth.inv(ring[0][0], ring[0][1], ring[1][0], ring[1][1])
+    _, _, north = earth.inv(ring[1][0], ring[1][1], ring[2][0], ring[2][1])
     np.testing.assert_allclose(line, [[0, 0], [east, 0], [east, north]], rtol=1e-4, atol=1e-9)
 
 

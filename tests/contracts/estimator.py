@@ -6,7 +6,7 @@ take rows.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -58,6 +58,18 @@ def messages_of(estimator: Any, tables: Tables) -> list[Message]:
             for t_ns, log_ns, values in zip(table["t_ns"].to_list(), logs, rows, strict=True):
                 found.append(Message(need.name, t_ns, values, log_ns, topic))
     return sorted(found, key=lambda m: m.log_ns)
+
+
+def taken(estimator: Any, message: Message) -> list[Result]:
+    """Return what an estimator answers to one message."""
+    results: Iterable[Result] = estimator.take(message) or ()
+    return list(results)
+
+
+def ended_by(estimator: Any) -> list[Result]:
+    """Return what an estimator still holds."""
+    results: Iterable[Result] = estimator.finish() or ()
+    return list(results)
 
 
 class DeclarationContract:
@@ -141,27 +153,27 @@ class EstimatorContract(DeclarationContract):
     def test_an_interrupted_run_equals_an_uninterrupted_one(self) -> None:
         whole = self.started()
         messages = messages_of(whole, self.tables())
-        expected = [list(whole.take(m) or ()) for m in messages]
-        ended = list(whole.finish() or ())
+        expected = [taken(whole, m) for m in messages]
+        ended = ended_by(whole)
         for at in (0, 1, len(messages) // 3, len(messages) - 1):
             one = self.started()
-            head = [list(one.take(m) or ()) for m in messages[:at]]
+            head = [taken(one, m) for m in messages[:at]]
             kept = one.snapshot()
             for m in messages[at : at + 50]:  # goes astray
-                list(one.take(m) or ())
+                taken(one, m)
             one.restore(kept)
-            assert _same(head + [list(one.take(m) or ()) for m in messages[at:]], expected)
-            assert _same([list(one.finish() or ())], [ended])
+            assert _same(head + [taken(one, m) for m in messages[at:]], expected)
+            assert _same([ended_by(one)], [ended])
             other = self.started()
             other.restore(kept)
-            assert _same([list(other.take(m) or ()) for m in messages[at:]], expected[at:])
+            assert _same([taken(other, m) for m in messages[at:]], expected[at:])
 
     def test_blocks_of_any_size_equal_single_messages(self) -> None:
         estimator = self.started()
         if not isinstance(estimator, KernelEstimator):
             pytest.skip("takes single messages only")
         messages = messages_of(estimator, self.tables())
-        expected = [list(estimator.take(m) or ()) for m in messages]
+        expected = [taken(estimator, m) for m in messages]
         inputs = np.array([[i.name for i in estimator.inputs].index(m.input) for m in messages])
         channels = np.array(
             [estimator.channel_index(int(i), m.channel) for i, m in zip(inputs, messages, strict=True)]
@@ -188,14 +200,14 @@ class EstimatorContract(DeclarationContract):
         estimator, tables = self.started(), self.tables()
         before = {i: {t: v.clone() for t, v in by.items()} for i, by in tables.items()}
         for message in messages_of(estimator, tables):
-            list(estimator.take(message) or ())
+            taken(estimator, message)
         assert all(v.equals(before[i][t]) for i, by in tables.items() for t, v in by.items())
 
     def test_remarks_can_be_read_at_any_time(self) -> None:
         estimator = self.started()
         assert isinstance(estimator.remarks(), list)
         for message in messages_of(estimator, self.tables()):
-            list(estimator.take(message) or ())
+            taken(estimator, message)
         assert isinstance(estimator.remarks(), list)
 
 
