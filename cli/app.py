@@ -46,7 +46,12 @@ COMMANDS: tuple[tuple[Group, str, str, str], ...] = (
     (RAW, "align", "align:align", "Move the optical clock of a recording to the inertial one."),
     (WORK, "info", "contents:info", "Show what a recording holds."),
     (WORK, "check", "contents:check", "Look for what is wrong with a recording."),
-    (WORK, "estimators", "available:estimators", "List the estimators, and the parameters of those named."),
+    (
+        WORK,
+        "estimators",
+        "available:estimators",
+        "List estimators and calibrations, with parameters of those named.",
+    ),
     (WORK, "replay", "replay:replay", "Feed a recording to estimators as if it were live."),
     (WORK, "evaluate", "replay:evaluate", "Measure the estimates of a replayed recording."),
     (WORK, "calibrate", "calibrate:calibrate", "Let a calibration look at recordings and write its result."),

@@ -40,17 +40,19 @@ def formats(*, common: Common = DEFAULT) -> Outcome:
 
 
 def estimators(*names: str, common: Common = DEFAULT) -> Outcome:
-    """List the estimators, and the parameters of those named.
+    """List estimators and calibrations, with parameters of those named.
 
     Parameters
     ----------
     names : str
-        Estimators to describe in full.
+        Estimators or calibrations to describe in full.
     """
     from .. import algorithms
 
+    calibrations = algorithms.available(algorithms.CALIBRATIONS)
     for name in names:
-        algorithms.find(name)  # an unknown one is an error that lists them
+        if name not in calibrations:
+            algorithms.find(name)  # an unknown one is an error that lists them
     entries = [
         {
             "name": name,
@@ -63,8 +65,18 @@ def estimators(*names: str, common: Common = DEFAULT) -> Outcome:
         for name, kind in algorithms.available().items()
         if not names or name in names
     ]
+    described = [
+        {"name": name, "title": kind.title, "source": kind.source, "parameters": _parameters(kind.Params)}
+        for name, kind in calibrations.items()
+        if not names or name in names
+    ]
     if not names:
-        return Outcome({"estimators": entries}, _overview(entries))
+        listed = Table(
+            ["calibration (marcha calibrate)", "what it is"], [[c["name"], c["title"]] for c in described]
+        )
+        lines = [*_overview(entries)[:-1], Heading(""), listed, *_overview(entries)[-1:]]
+        return Outcome({"estimators": entries, "calibrations": described}, lines)
+    entries += [c | {"offline": False, "presets": {}} for c in described]
     lines: list[Heading | Table] = []
     for entry in entries:
         offline = " (offline: needs the whole recording)" if entry["offline"] else ""
