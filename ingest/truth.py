@@ -70,7 +70,8 @@ def read_truth(path: Path) -> Truth | None:
     files = []
     if (steps := path.with_name(f"{path.stem}.truth.steps.csv")).is_file():
         files.append(steps)
-        tables.append((ChannelSpec("/reference/steps", STEP, "nav"), _steps(steps)))
+        walked = _steps(steps)  # without a row where nobody walks: the columns are said beforehand
+        tables.append((ChannelSpec("/reference/steps", STEP, "nav", tuple(walked.columns[1:])), walked))
     for part, name in parts.items():
         if (file := path.with_name(name)).is_file():
             files.append(file)

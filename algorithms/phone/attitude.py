@@ -51,8 +51,6 @@ FIELDS: list[tuple[Any, ...]] = [
     ("mag_n", "i8"),
     ("tau_mag", "f8"),
     ("mag_gain", "f8"),
-    ("hard", "f8", (3,)),
-    ("soft", "f8", (3, 3)),
     ("ref_norm", "f8"),
     ("ref_dip", "f8"),
     ("ref_fixed", "i8"),
@@ -94,7 +92,6 @@ def configure(
     s["bias_clip"] = math.radians(2.0)
     s["rest_gyr_max"], s["rest_acc_max"] = math.radians(rest_deg_s), 0.5 * rest_deg_s / 2.0
     s["mag_gain"] = 1.0
-    s["soft"][:] = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
     s["dis_norm"], s["dis_dip"] = 0.15, math.radians(12.0)
 
 
@@ -283,15 +280,11 @@ def wrap(angle: float) -> float:
 @compiled
 def take_mag(s: Any, t_ns: int, x: float, y: float, z: float) -> None:
     """Take a magnetic field (T) after hard and soft iron: heading, norm, dip, disturbance."""
-    x, y, z = x - s.hard[0], y - s.hard[1], z - s.hard[2]
-    u = s.soft[0, 0] * x + s.soft[0, 1] * y + s.soft[0, 2] * z
-    v = s.soft[1, 0] * x + s.soft[1, 1] * y + s.soft[1, 2] * z
-    w = s.soft[2, 0] * x + s.soft[2, 1] * y + s.soft[2, 2] * z
     dt = (t_ns - s.mag_ns) * 1e-9 if s.mag_ns != 0 else s.acc_dt
     s.mag_ns = t_ns
     if s.att_ready == 0:
         return
-    e, n, up = level(s, u, v, w)
+    e, n, up = level(s, x, y, z)
     across = math.sqrt(e * e + n * n)
     norm = math.sqrt(across * across + up * up)
     if across < 1e-9:
@@ -302,8 +295,10 @@ def take_mag(s: Any, t_ns: int, x: float, y: float, z: float) -> None:
     s.mag_norm = norm if s.mag_n == 0 else s.mag_norm + k * (norm - s.mag_norm)
     s.mag_dip = dip if s.mag_n == 0 else s.mag_dip + k * (dip - s.mag_dip)
     s.mag_n += 1
-    if s.ref_norm == 0.0:
-        s.ref_norm, s.ref_dip = norm, dip
+    if s.mag_n == 1:
+        s.ref_dip = dip
+        if s.ref_norm == 0.0:  # a calibration knows the norm beforehand, never the dip
+            s.ref_norm = norm
     odd = abs(s.mag_norm / s.ref_norm - 1.0) > s.dis_norm or abs(s.mag_dip - s.ref_dip) > s.dis_dip
     s.undisturbed_s = 0.0 if odd else s.undisturbed_s + dt
     s.disturbed_s = s.disturbed_s + dt if odd else 0.0

@@ -10,7 +10,6 @@ import numpy as np
 
 from ..contract import (
     ALL_COLUMNS,
-    AlgorithmError,
     Context,
     Input,
     KernelEstimator,
@@ -154,14 +153,12 @@ class PhoneTrack(KernelEstimator):
         super().__init__(params)
         self.state = np.zeros(1, self.dtype)
         self._columns: dict[str, tuple[str, ...]] = {}
-        self._notes: list[Remark] = []
 
     def start(self, context: Context) -> None:
         """Set windows by the measured rates; take calibration and channels."""
         super().start(context)
         p, s = self.params, self.state[0]
         self.state[:] = np.zeros(1, self.dtype)
-        self._notes = []
         self._columns = {name: c[0].columns for name, c in context.channels.items() if c}
         rate = p.rate_hz or context.rate_hz("acc") or 50.0
         steps.configure(s, p, rate)
@@ -196,19 +193,11 @@ class PhoneTrack(KernelEstimator):
             s["sd_default"], s["sd_min"] = p.gnss_sd_m, p.gnss_sd_min_m
 
     def _calibrate(self, context: Context, s: Any) -> bool:
-        """Write the magnetometer's calibration into the state; return whether there is one."""
-        found = context.calibrations.get("magnetometer")
-        if found is None or not context.has("mag"):
+        """Write the calibrated field's strength into the state; return whether there is a calibration."""
+        field_t = calibrated_field(context)
+        if field_t is None:
             return False
-        if not found.usable:
-            self._notes.append(
-                Remark("calibration_unused", "the magnetometer's calibration is marked unusable and left out")
-            )
-            return False
-        hard, soft, norm = magnetometer_values(found.values)
-        s["hard"][:], s["soft"][:] = hard, soft
-        if norm > 0:
-            s["ref_norm"] = norm
+        s["ref_norm"] = field_t
         return True
 
     def take(self, message: Message) -> list[Result]:
@@ -237,8 +226,8 @@ class PhoneTrack(KernelEstimator):
 
     def remarks(self) -> list[Remark]:
         """Say what a user must know."""
-        s, found = self.state[0], list(self._notes)
-        found += steps.step_remarks(s)
+        s = self.state[0]
+        found = steps.step_remarks(s)
         if s["has_gyr"] and s["gyr_ns"] == 0:
             found.append(Remark("no_gyroscope", "no sample of the gyroscope arrived: headings stand still"))
         if not s["has_mag"] and not self.fused:
@@ -273,18 +262,16 @@ class PhoneTrack(KernelEstimator):
         return found
 
 
-def magnetometer_values(values: dict[str, Any]) -> tuple[FloatArray, FloatArray, float]:
-    """Return hard iron (T), soft-iron matrix and norm (T; 0 unknown) of a calibration's values."""
-    hard = values.get("mag_offset_t")
-    if hard is None:
-        raise AlgorithmError(f"calibration magnetometer has no mag_offset_t; it has {', '.join(values)}")
-    soft = values.get("mag_matrix")
-    norm = values.get("field_t")
-    return (
-        np.asarray(hard, dtype=np.float64),
-        np.eye(3) if soft is None else np.asarray(soft, dtype=np.float64),
-        float(norm or 0.0),
-    )
+def calibrated_field(context: Context) -> float | None:
+    """Return the field's strength (T; 0 unknown) by the calibration of the attached magnetometer, None without one.
+
+    The readings themselves arrive corrected: who feeds an estimator applies offset and matrix beforehand.
+    """
+    topics = [c.topic for c in context.channels.get("mag", ())]
+    for one in context.calibrations.values():
+        if one.kind == "magnetometer" and one.usable and topics and one.subject in ("", topics[0]):
+            return float(one.values.get("field_t") or 0.0)
+    return None
 
 
 def encode_fixes(table: pl.DataFrame) -> FloatArray:

@@ -13,7 +13,7 @@ from ..numerics.compiled import compiled
 from ..parameters import meta
 from . import attitude, direction, lengths, ring, steps
 from .lengths import LengthParams
-from .pdr import GYR, MAG, POSE, SourceParams, magnetometer_values
+from .pdr import GYR, MAG, POSE, SourceParams, calibrated_field
 from .steps import ACC, StepParams
 
 STEP_COLUMNS = ("start_ns", "end_ns", "index", "length_m", "height_m", "heading_rad")
@@ -108,9 +108,7 @@ class PhoneAttitude(KernelEstimator):
             rest_deg_s=p.rest_deg_s,
         )
         s["declination"] = math.radians(p.declination_deg)
-        found = context.calibrations.get("magnetometer")
-        if found is not None and found.usable:
-            s["hard"][:], s["soft"][:], s["ref_norm"] = magnetometer_values(found.values)
+        s["ref_norm"] = calibrated_field(context) or 0.0
 
 
 class _OverSteps(PlainEstimator):
@@ -136,7 +134,8 @@ class _OverSteps(PlainEstimator):
         self.state[:] = snapshot
 
 
-_LENGTH_FIELDS = [*steps.FIELDS, *lengths.FIELDS]
+# not steps.FIELDS first: a record that begins like another one makes the compiler warn
+_LENGTH_FIELDS = [*lengths.FIELDS, *steps.FIELDS]
 
 
 @compiled
@@ -176,7 +175,7 @@ class PhoneLength(_OverSteps):
         return [Result("step", message.t_ns, (start, end, index, length, height, heading))]
 
 
-_HEADING_FIELDS = [*steps.FIELDS, *attitude.FIELDS, *direction.FIELDS]
+_HEADING_FIELDS = [*attitude.FIELDS, *direction.FIELDS, *steps.FIELDS]
 
 
 @compiled
@@ -228,9 +227,7 @@ class PhoneHeading(_OverSteps):
         s["declination"] = math.radians(p.declination_deg)
         s["has_mag"] = context.has("mag") and p.magnetometer != "off"
         s["median_w"] = min(64, max(1, round(p.median_s * (context.rate_hz("mag") or rate))))
-        found = context.calibrations.get("magnetometer")
-        if found is not None and found.usable:
-            s["hard"][:], s["soft"][:], s["ref_norm"] = magnetometer_values(found.values)
+        s["ref_norm"] = calibrated_field(context) or 0.0
 
     def take(self, message: Message) -> list[Result] | None:
         """Keep a sample, or find a step's heading."""

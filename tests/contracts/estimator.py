@@ -179,7 +179,7 @@ class EstimatorContract(DeclarationContract):
             [estimator.channel_index(int(i), m.channel) for i, m in zip(inputs, messages, strict=True)]
         )
         t_ns = np.array([m.t_ns for m in messages], np.int64)
-        values = _encoded(estimator, inputs, channels, messages)
+        values = _encoded(estimator, self.context(estimator), inputs, channels, messages)
         for size in (1, 7, len(messages)):
             block, got = self.started(), []
             for a in range(0, len(messages), size):
@@ -211,13 +211,15 @@ class EstimatorContract(DeclarationContract):
         assert isinstance(estimator.remarks(), list)
 
 
-def _encoded(estimator: KernelEstimator, inputs: Any, channels: Any, messages: list[Message]) -> np.ndarray:
+def _encoded(
+    estimator: KernelEstimator, context: Context, inputs: Any, channels: Any, messages: list[Message]
+) -> np.ndarray:
     rows = []
     for index, channel, message in zip(inputs.tolist(), channels.tolist(), messages, strict=True):
-        columns = estimator.inputs[index].columns
-        if columns == ALL_COLUMNS:
-            columns = tuple(f"column_{i}" for i in range(len(message.values)))
-        table = pl.DataFrame({c: [v] for c, v in zip(columns, message.values, strict=True)})
+        columns = context.channels[message.input][channel].columns
+        table = pl.DataFrame(
+            {"t_ns": [message.t_ns], **{c: [v] for c, v in zip(columns, message.values, strict=True)}}
+        )
         rows.append(estimator.encode(index, channel, table)[0])
     values = np.full((len(rows), max(len(r) for r in rows)), np.nan)
     for i, row in enumerate(rows):

@@ -1,0 +1,149 @@
+"""Estimators of phones: their contract, and a simulated walk from the calibration to the track."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any, ClassVar
+
+import marcha.recording as mr
+import marcha.replay as rp
+import numpy as np
+import polars as pl
+import pytest
+from marcha.ingest import convert
+from marcha.ingest.simulate import PhoneWalk, phone_walk, simulate
+
+from .contracts.estimator import EstimatorContract, Tables
+from .phone_samples import short_walk
+
+FIXES = ("lat_deg", "lon_deg", "alt_m", "sd_east_m", "sd_north_m", "sd_up_m")
+
+
+@cache
+def sensors() -> dict[str, pl.DataFrame]:
+    """Return tables of a walk of 10 m by sensor, about 12 s."""
+    walk = short_walk(rate_hz=25, rest_s=1.5, pressure_hz=1, seed=4)
+    t_ns = pl.Series("t_ns", walk.t_ns)
+
+    def table(name: str, values: np.ndarray) -> pl.DataFrame:
+        return pl.DataFrame([t_ns, *(pl.Series(f"{name}_{a}", values[:, i]) for i, a in enumerate("xyz"))])
+
+    return {
+        "acc": table("acc", walk.acc_b),
+        "gyr": table("gyr", walk.gyr_b),
+        "mag": table("mag", walk.mag_b),
+        "pressure": walk.pressure,
+        "gnss": walk.fixes.select("t_ns", *FIXES).with_columns(status=pl.lit(0)),
+    }
+
+
+class PhoneContract(EstimatorContract):
+    """Feed what the estimator takes."""
+
+    def tables(self) -> Tables:
+        return {i.name: {f"/phone/{i.name}": sensors()[i.name]} for i in self.make().inputs}
+
+
+class TestSteps(PhoneContract):
+    name = "phone.steps"
+
+
+class TestSourceSteps(PhoneContract):
+    name = "phone.steps"
+    params: ClassVar = {"method": "peaks"}
+
+
+class TestPdr(PhoneContract):
+    name = "phone.pdr"
+
+
+class TestFused(PhoneContract):
+    name = "phone.fused"
+
+
+HARD_IRON = (30e-6, -24e-6, 14e-6)
+
+
+def turned_about(path: Path, strength_t: float) -> mr.Recording:
+    """Record the magnetometer of the same device while it is turned about all axes."""
+    directions = np.random.default_rng(6).normal(size=(600, 3))
+    field = strength_t * directions / np.linalg.norm(directions, axis=1, keepdims=True) + HARD_IRON
+    field += np.random.default_rng(7).normal(scale=0.4e-6, size=field.shape)
+    times = pl.Series("t_ns", 10**18 + 20_000_000 * np.arange(600))
+    table = pl.DataFrame([times, *(pl.Series(f"mag_{a}", field[:, i]) for i, a in enumerate("xyz"))])
+    with mr.create(path) as out:
+        out.add_table("/phone/mag", "sensor_msgs/msg/MagneticField", table, frame_id="body")
+    return mr.open(path)
+
+
+def walked(folder: Path) -> tuple[mr.Recording, PhoneWalk]:
+    """Simulate a walk of 32 m with two turns as an app's files, and convert them."""
+    options: dict[str, Any] = {
+        "route": "12:right 90,12:left 90,8",
+        "hard_iron_t": HARD_IRON,
+        "soft_iron": 0.0,
+        "rate_hz": 50,
+    }
+    made = simulate("phone-turns", folder / "raw", seed=5, format="phyphox", **options)
+    convert(made.paths, folder / "walk.mcap")
+    return mr.open(folder / "walk.mcap"), phone_walk("phone-turns", seed=5, **options)
+
+
+def test_calibration_steps_and_dead_reckoning_in_one_pass(tmp_path: Path) -> None:
+    """With its calibration the track lies on the simulated one without any alignment; without it turned away."""
+    rec, walk = walked(tmp_path)
+    (found,) = rp.calibrate(
+        "magnetometer", [turned_about(tmp_path / "turned.mcap", np.linalg.norm(walk.mag_true[0]))]
+    )
+    assert found.usable
+    pdr = f"phone.pdr[declination_deg={np.degrees(walk.declination_rad)}]"
+    apart = {}
+    for name, given in (("with", [found]), ("without", [])):
+        result = rp.replay(rec, ["phone.steps", pdr], calibrations=given)
+        steps, track = result.runs
+        assert abs(steps.tables["step"].height - walk.steps.height) <= 1
+        assert steps.metrics["steps_recall"] >= 0.95
+        assert steps.metrics["steps_precision"] >= 0.95
+        assert track.tables["step"].select("t_ns").equals(steps.tables["step"].select("t_ns"))
+        apart[name] = distances(track.tables["pose"], walk)
+        remarks = {f.kind for f in track.findings}
+        assert ("calibrated" in remarks, "mag_uncalibrated" in remarks) == (bool(given), not given)
+        if given:
+            assert track.tables["heading"]["disturbed"].mean() < 0.1
+    assert apart["with"].max() < 0.08 * walk.length_m
+    assert apart["without"].max() > 4 * apart["with"].max()
+
+
+def test_stages_in_a_chain_give_the_track_of_the_whole(tmp_path: Path) -> None:
+    """Steps, lengths and headings by stages, summed: the steps of ``phone.pdr`` and nearly its track."""
+    rec, walk = walked(tmp_path)
+    chain = "phone.steps+phone.length+phone.heading+phone.track"
+    *_, by_stages, whole = rp.replay(rec, [chain, "phone.pdr"]).runs
+    ours, theirs = by_stages.tables["pose"], whole.tables["pose"]
+    assert ours["t_ns"].equals(theirs["t_ns"])
+    assert by_stages.metrics["path_m"] == pytest.approx(whole.metrics["path_m"], rel=1e-6)
+    assert by_stages.metrics["ate_rmse_m"] < 0.05 * walk.length_m
+
+
+def test_offline_estimators_lie_on_the_fixes(tmp_path: Path) -> None:
+    rec, walk = walked(tmp_path)
+    for run in rp.replay(rec, ["phone.smooth", "phone.transform", "phone.pdr-source"]).runs:
+        assert not [f for f in run.findings if f.kind in ("not_smoothed", "not_transformed")]
+        if "fix" in run.tables:
+            fix = run.tables["fix"]
+            assert np.isfinite(fix["lat_deg"].to_numpy()).all()
+            north_m = (fix["lat_deg"].to_numpy() - walk.options.lat_deg) * 111_000
+            assert np.abs(north_m).max() < 40.0
+
+
+def distances(pose: pl.DataFrame, walk: PhoneWalk) -> np.ndarray:
+    """Return the distances (m) of a track's positions from the true ones of their times, nothing aligned.
+
+    Files of this app count from the first sample.
+    """
+    t = pose["t_ns"].to_numpy()
+    true = walk.t_ns - (walk.t_ns[0] if t[0] < 10**17 else 0)
+    return np.hypot(
+        *(pose[f"pos_{a}"].to_numpy() - np.interp(t, true, walk.pos[:, i]) for i, a in enumerate("xy"))
+    )
