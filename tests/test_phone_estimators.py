@@ -94,7 +94,7 @@ def test_calibration_steps_and_dead_reckoning_in_one_pass(tmp_path: Path) -> Non
     """With its calibration the track lies on the simulated one without any alignment; without it turned away."""
     rec, walk = walked(tmp_path)
     (found,) = rp.calibrate(
-        "magnetometer", [turned_about(tmp_path / "turned.mcap", np.linalg.norm(walk.mag_true[0]))]
+        "magnetometer", [turned_about(tmp_path / "turned.mcap", float(np.linalg.norm(walk.mag_true[0])))]
     )
     assert found.usable
     pdr = f"phone.pdr[declination_deg={np.degrees(walk.declination_rad)}]"
@@ -110,7 +110,7 @@ def test_calibration_steps_and_dead_reckoning_in_one_pass(tmp_path: Path) -> Non
         remarks = {f.kind for f in track.findings}
         assert ("calibrated" in remarks, "mag_uncalibrated" in remarks) == (bool(given), not given)
         if given:
-            assert track.tables["heading"]["disturbed"].mean() < 0.1
+            assert track.tables["heading"]["disturbed"].to_numpy().mean() < 0.1
     assert apart["with"].max() < 0.08 * walk.length_m
     assert apart["without"].max() > 4 * apart["with"].max()
 
