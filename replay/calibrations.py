@@ -44,6 +44,15 @@ def calibrations_of(metadata: Mapping[str, Mapping[str, str]]) -> list[Calibrati
     ]
 
 
+def usable(calibrations: Iterable[Calibration]) -> dict[str, Calibration]:
+    """Return those that may be applied, by kind and subject; the first of a kind and subject counts."""
+    found: dict[str, Calibration] = {}
+    for one in calibrations:
+        if one.usable:
+            found.setdefault(f"{one.kind}:{one.subject}" if one.subject else one.kind, one)
+    return found
+
+
 def metadata_of(calibrations: Iterable[Calibration]) -> dict[str, dict[str, str]]:
     """Return the metadata records that keep calibrations in a recording."""
     return {
@@ -132,13 +141,13 @@ def calibrate(
     chosen = Chosen.parse(inputs or ())
     sources = [RecordingSource(r) for r in recordings]
     chosen.check(sources[0], (i.name for i in calibrator.inputs))
+    spans = [(s, span, label) for s in sources for span, label in _spans(s, interval, start_ns, end_ns)]
+    digests = {id(s): hash_file(Path(s.recording.path)) for s in sources}
     found: list[Calibration] = []
     for attachment in attach(calibrator.inputs, name, sources[0], chosen, {}):
         topics = {role: tuple(c.topic for c in channels) for role, channels in attachment.channels.items()}
         stretches = [
-            _stretch(source, calibrator.inputs, topics, span, label)
-            for source in sources
-            for span, label in _spans(source, interval, start_ns, end_ns)
+            _stretch(source, calibrator.inputs, topics, span, label) for source, span, label in spans
         ]
         try:
             result = calibrator.calibrate(stretches)
@@ -149,12 +158,11 @@ def calibrate(
         result.computed_from = [
             {
                 "recording": source.name,
-                "blake2b": hash_file(Path(source.recording.path)),
+                "blake2b": digests[id(source)],
                 "start_ns": str(span[0] if span[0] is not None else source.start_ns),
                 "end_ns": str(span[1] if span[1] is not None else source.end_ns),
             }
-            for source in sources
-            for span, _ in _spans(source, interval, start_ns, end_ns)
+            for source, span, _ in spans
         ]
         found.append(result)
     return found
@@ -214,14 +222,14 @@ Correction = Callable[[pl.DataFrame], pl.DataFrame]
 
 def corrections(
     calibrations: Sequence[Calibration], channels: Mapping[str, Any]
-) -> tuple[dict[str, Correction], list[Finding]]:
-    """Return what is done to the tables of raw channels before estimators see them, by topic, and say so.
+) -> tuple[dict[str, Correction], dict[str, list[Finding]]]:
+    """Return what is done to the tables of raw channels before estimators see them, and what to say of it, by topic.
 
     A calibration of kind ``imu`` or ``magnetometer`` corrects the channel that its subject names, or, where it
     names none, every channel of its message type.
     """
     steps: dict[str, list[tuple[tuple[str, ...], FloatArray, FloatArray]]] = {}
-    findings: list[Finding] = []
+    findings: dict[str, list[Finding]] = {}
     for one in calibrations:
         for schema, columns, matrix, offset in CORRECTED.get(one.kind, ()):
             if offset not in one.values and matrix not in one.values:
@@ -234,7 +242,7 @@ def corrections(
                 if one.subject in ("", topic):
                     steps.setdefault(topic, []).append((columns, m, b))
                     detail = f"{topic}: {columns[0][:3]} corrected by calibration {one.kind} before estimators saw it"
-                    findings.append(Finding("calibrated", 1, None, detail))
+                    findings.setdefault(topic, []).append(Finding("calibrated", 1, None, detail))
     return {topic: _correction(done) for topic, done in steps.items()}, findings
 
 

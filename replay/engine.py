@@ -481,7 +481,8 @@ class Engine:
         findings, fatal = runner.findings()
         outputs = {name: c.topic for name, c in plan.outputs.items()}
         gap = policy_of(self.gap, plan.inputs[0].input)
-        findings = [*findings, *self._corrected] if self._corrected else findings
+        read = dict.fromkeys(c.topic for c in plan.inputs)
+        findings = [*findings, *(f for topic in read for f in self._corrected.get(topic, ()))]
         lineage = {
             "run": plan.run,
             "estimator": plan.name,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -92,12 +92,6 @@ class MessageBlock:
         names = np.array([p.channel.input for p in self.pieces], object)[whose].tolist()
         topics = np.array([p.channel.topic for p in self.pieces], object)[whose].tolist()
         return map(Message, names, self.t_ns.tolist(), rows, self.t_log_ns.tolist(), topics)
-
-
-@dataclass
-class _State:
-    stopped: bool = False
-    fed: dict[str, int] = field(default_factory=dict)
 
 
 class MessageFeed:

@@ -27,7 +27,7 @@ from ..algorithms.contract import (
 )
 from ..recording.errors import Finding, UsageError
 from .attachment import Attachment, Chosen, attach, device_of, serving
-from .calibrations import calibrations_of
+from .calibrations import calibrations_of, usable
 from .messages import AttachedChannel
 from .sources import PlannedChannel, Source
 
@@ -131,8 +131,6 @@ class PlannedRun:
         What the user must know before the run.
     calibrations : tuple of Calibration
         Those that it was given.
-    stage_of : tuple of str
-        Runs that read its outputs.
     """
 
     run: str
@@ -277,7 +275,7 @@ class _Planner:
         self.params = params
         self.chosen = chosen
         self.taken = tuple(taken)
-        self.given = tuple(calibrations)
+        self.calibrations = usable((*calibrations, *calibrations_of(source.metadata)))
         self.runs: list[PlannedRun] = []
 
     def default_stages(self, maker: _Maker, above: tuple[str, ...] = ()) -> list[_Maker]:
@@ -368,7 +366,7 @@ class _Planner:
         if wanted in self.taken:
             detail = f"the recording has a run {wanted} already: this one is {run}"
             notes.append(Finding("renamed_run", 1, None, detail))
-        calibrations = self._calibrations()
+        calibrations = self.calibrations
         if hasattr(estimator, "start"):
             try:
                 estimator.start(self._context(attached, attachment, calibrations))
@@ -398,15 +396,6 @@ class _Planner:
         self.runs.append(planned)
         return planned
 
-    def _calibrations(self) -> dict[str, Calibration]:
-        """Return the usable calibrations by kind and by kind and subject; given ones before the recording's own."""
-        own = calibrations_of(getattr(self.source, "metadata", {}))
-        found: dict[str, Calibration] = {}
-        for one in (*self.given, *own):
-            if one.usable:
-                found.setdefault(f"{one.kind}:{one.subject}" if one.subject else one.kind, one)
-        return found
-
     def _context(
         self,
         attached: Sequence[AttachedChannel],
@@ -424,9 +413,9 @@ class _Planner:
         by_kind = {c.kind: c for c in reversed(list(calibrations.values()))}
         return Context(
             {name: tuple(found) for name, found in infos.items()},
-            getattr(self.source, "metadata", {}),
-            getattr(self.source, "attachments", {}),
-            getattr(self.source, "static", {}),
+            self.source.metadata,
+            self.source.attachments,
+            self.source.static,
             {**by_kind, **calibrations},
         )
 

@@ -13,6 +13,7 @@ import numpy as np
 import polars as pl
 
 from ..algorithms.contract import (
+    TIMES,
     FloatArray,
     IntArray,
     KernelEstimator,
@@ -138,7 +139,7 @@ class Runner:
     def _block(self, output: Output, rows: Columns, keys: IntArray) -> Block:
         """Give the columns of an output their types and note its annotations."""
         data = {
-            name: values if name in _TIMES else _typed(output, name, values) for name, values in rows.items()
+            name: values if name in TIMES else _typed(output, name, values) for name, values in rows.items()
         }
         if output.schema == "marcha_msgs/msg/Step":
             data = _with_swing_times(data)
@@ -443,9 +444,6 @@ class MessageRunner(Runner):
                 data[column] = np.array(values)
             blocks[name] = self._block(output, data, keys[caused])
         return blocks
-
-
-_TIMES = ("t_ns", "t_log_ns")
 
 
 def _typed(output: Output, name: str, values: Any) -> Any:

@@ -172,11 +172,14 @@ class RecordingSource:
         self.metadata = recording.metadata
         self.attachments = _Attachments(recording)
         self._rates: dict[str, float] = {}
+        self._static: dict[str, pl.DataFrame] | None = None
 
     @property
     def static(self) -> dict[str, pl.DataFrame]:
         """Static frames by topic."""
-        return {t: self.recording.table(t) for t in self.channels if t.endswith("_static")}
+        if self._static is None:
+            self._static = {t: self.recording.table(t) for t in self.channels if t.endswith("_static")}
+        return self._static
 
     def rate_hz(self, topic: str) -> float:
         """Return the rate of the channel's first samples in hertz."""

@@ -7,55 +7,43 @@ from typing import Any
 
 import numpy as np
 import polars as pl
-from marcha.algorithms import ALL_COLUMNS, ChannelInfo, Context, Message
-from marcha.algorithms.contract import TIMES
+from marcha.algorithms import Context, Message
+
+from .contracts import estimator as contract
+from .contracts.estimator import Tables
 
 
 def context_of(
     estimator: Any,
-    tables: Mapping[str, Mapping[str, pl.DataFrame]],
+    tables: Tables,
     metadata: Mapping[str, Mapping[str, str]] | None = None,
     attachments: Mapping[str, bytes] | None = None,
     calibrations: Mapping[str, Any] | None = None,
 ) -> Context:
     """Return the context of channels given as ``{input name: {topic: table}}``."""
-    channels: dict[str, tuple[ChannelInfo, ...]] = {}
-    for need in estimator.inputs:
-        infos = []
-        for topic, table in tables.get(need.name, {}).items():
-            columns = tuple(c for c in table.columns if c not in TIMES)
-            intervals = np.diff(table["t_ns"].to_numpy())
-            rate = 1e9 / float(np.median(intervals)) if intervals.size and np.median(intervals) > 0 else 0.0
-            wanted = columns if need.columns == ALL_COLUMNS else need.columns
-            infos.append(ChannelInfo(topic, need.schema, "", wanted, rate))
-        channels[need.name] = tuple(infos)
+    channels = contract.context_of(estimator, tables).channels
     return Context(channels, metadata or {}, attachments or {}, {}, calibrations or {})
 
 
-def messages_of(estimator: Any, tables: Mapping[str, Mapping[str, pl.DataFrame]]) -> list[Message]:
-    """Return all messages by log time; ties by the order of the inputs and channels given."""
-    found: list[tuple[int, Message]] = []
-    for need in estimator.inputs:
-        for topic, table in tables.get(need.name, {}).items():
-            columns = [c for c in table.columns if c not in TIMES]
-            wanted = columns if need.columns == ALL_COLUMNS else list(need.columns)
-            logs = table["t_log_ns"] if "t_log_ns" in table.columns else table["t_ns"]
-            rows = table.select(wanted).rows()
-            last: int | None = None
-            for t_ns, log_ns, values in zip(table["t_ns"].to_list(), logs.to_list(), rows, strict=True):
-                if need.regular:
-                    if not all(v is not None and np.isfinite(v) for v in values):
-                        continue
-                    if last is not None and t_ns <= last:
-                        continue
-                    last = t_ns
-                found.append((log_ns, Message(need.name, t_ns, values, log_ns, topic)))
-    return [m for _, m in sorted(found, key=lambda pair: pair[0])]
+def messages_of(estimator: Any, tables: Tables) -> list[Message]:
+    """Return what the engine hands over: of regular inputs only finite values at ascending times of a channel."""
+    regular = {need.name for need in estimator.inputs if need.regular}
+    last: dict[tuple[str, str], int] = {}
+    found: list[Message] = []
+    for message in contract.messages_of(estimator, tables):
+        if message.input in regular:
+            channel = (message.input, message.channel)
+            finite = all(v is not None and np.isfinite(v) for v in message.values)
+            if not finite or message.t_ns <= last.get(channel, message.t_ns - 1):
+                continue
+            last[channel] = message.t_ns
+        found.append(message)
+    return found
 
 
 def drive(
     estimator: Any,
-    tables: Mapping[str, Mapping[str, pl.DataFrame]],
+    tables: Tables,
     context: Context | None = None,
     **about: Any,
 ) -> dict[str, pl.DataFrame]:

@@ -214,6 +214,18 @@ def test_a_calibration_of_the_recording_itself_is_used(imu: mr.Recording, tmp_pa
     assert "calibrated" in {f.kind for f in result.runs[0].findings}
 
 
+def test_only_runs_that_read_the_channel_say_so(imu: mr.Recording, tmp_path: Path) -> None:
+    other = imu.table("/hand/imu")
+    rec = recorded(
+        tmp_path / "two.mcap",
+        hand__imu=("sensor_msgs/msg/Imu", other),
+        foot__imu=("sensor_msgs/msg/Imu", other),
+    )
+    result = rp.replay(rec, [Norm()], calibrations=rp.calibrate("imu", [imu]))
+    said = {r.input: "calibrated" in {f.kind for f in r.findings} for r in result.runs}
+    assert said == {"/hand/imu": True, "/foot/imu": False}
+
+
 def test_an_unusable_calibration_is_never_applied(imu: mr.Recording) -> None:
     (found,) = rp.calibrate("imu", [imu])
     found.usable = False

@@ -25,8 +25,8 @@ from marcha.algorithms import (
     make,
     output_columns,
 )
+from marcha.algorithms.contract import TIMES
 
-TIMES = ("t_ns", "t_log_ns")
 Tables = Mapping[str, Mapping[str, pl.DataFrame]]
 """``{input name: {topic: table}}``; a table has ``t_ns``, the input's columns, and ``t_log_ns`` where it differs."""
 
