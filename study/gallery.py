@@ -12,11 +12,11 @@ from typing import Any
 import msgspec
 import polars as pl
 
+from ..viz.page import Picture
 from . import config as cfg
 from .analysis import order
 from .cells import Cell
 from .executors import Executor
-from .report import Picture
 
 
 class Drawing(msgspec.Struct, frozen=True):
@@ -25,7 +25,7 @@ class Drawing(msgspec.Struct, frozen=True):
     Attributes
     ----------
     name, section, caption : str
-        See :class:`~marcha.study.report.Picture`.
+        See :class:`~marcha.viz.page.Picture`.
     function : str
         Name of the function of :mod:`~marcha.study.figures` that returns it, or None.
     arguments : tuple

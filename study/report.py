@@ -2,41 +2,17 @@
 
 from __future__ import annotations
 
-import base64
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from html import escape
-from importlib import resources
-from string import Template
 from typing import Any
 
 import msgspec
 import polars as pl
 
+from ..viz.page import Html, Picture, number
 from . import config as cfg
 from .analysis import order
-
-
-class Picture(msgspec.Struct, frozen=True):
-    """A drawn figure.
-
-    Attributes
-    ----------
-    name : str
-        File name without suffix.
-    section : str
-        Part of the report that it belongs to.
-    caption : str
-        What it shows, for the report and for readers who cannot see it.
-    png, svg : bytes
-        The picture.
-    """
-
-    name: str
-    section: str
-    caption: str
-    png: bytes
-    svg: bytes
 
 
 class Material(msgspec.Struct, frozen=True):
@@ -72,18 +48,6 @@ class Material(msgspec.Struct, frozen=True):
 NEES_TITLES = {"nees_position_end": "position at the end", "nees_velocity_end": "velocity at the end"}
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    """Return a number with ``digits`` significant digits, or a dash where there is none."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    if value == 0:
-        return "0"
-    exponent = math.floor(math.log10(abs(value)))
-    if -4 <= exponent < 5:
-        return f"{value:.{max(0, digits - 1 - exponent)}f}"
-    return f"{value:.{digits - 1}e}"
-
-
 def probability(value: float | None) -> str:
     """Return a p value as it is written in papers."""
     if value is None or not math.isfinite(value):
@@ -103,76 +67,6 @@ def mean_sd(row: dict[str, Any] | None) -> str:
     return f"{text} ± {sd}"
 
 
-class Html:
-    """Collects the body of the page."""
-
-    def __init__(self) -> None:
-        self.parts: list[str] = []
-        self.sections: list[tuple[str, str]] = []
-
-    def section(self, title: str) -> None:
-        """Start a section."""
-        name = f"s{len(self.sections) + 1}"
-        self.sections.append((name, title))
-        self.parts.append(f'<h2 id="{name}">{escape(title)}</h2>')
-
-    def heading(self, title: str) -> None:
-        """Start a part of a section."""
-        self.parts.append(f"<h3>{escape(title)}</h3>")
-
-    def text(self, text: str, kind: str = "") -> None:
-        """Add a paragraph of plain text."""
-        self.parts.append(f"<p{f' class={kind}' if kind else ''}>{escape(text)}</p>")
-
-    def warning(self, lines: Sequence[str]) -> None:
-        """Add lines that must be seen."""
-        if lines:
-            items = "<br>".join(escape(line) for line in lines)
-            self.parts.append(f'<div class="warning">{items}</div>')
-
-    def table(self, head: Sequence[str], rows: Iterable[Sequence[str]], text_columns: int = 1) -> None:
-        """Add a table; cells are HTML already, the first ``text_columns`` columns are words.
-
-        A row of one cell is a heading across the table. A cell that starts with ``@class `` has that class.
-        """
-
-        def cell(tag: str, index: int, content: str) -> str:
-            classes = ["text"] if index < text_columns else []
-            if content.startswith("@"):
-                extra, _, content = content[1:].partition(" ")
-                classes.append(extra)
-            attribute = f' class="{" ".join(classes)}"' if classes else ""
-            return f"<{tag}{attribute}>{content}</{tag}>"
-
-        out = [
-            '<div class="scroll"><table><tr>',
-            *(cell("th", i, escape(h)) for i, h in enumerate(head)),
-            "</tr>",
-        ]
-        for row in rows:
-            if len(row) == 1:
-                out.append(f'<tr class="section"><td colspan="{len(head)}">{row[0]}</td></tr>')
-            else:
-                out += ["<tr>", *(cell("td", i, c) for i, c in enumerate(row)), "</tr>"]
-        self.parts.append("".join([*out, "</table></div>"]))
-
-    def pictures(self, pictures: Iterable[Picture]) -> None:
-        """Add pictures with their captions."""
-        for picture in pictures:
-            data = base64.b64encode(picture.png).decode()
-            caption = escape(picture.caption)
-            self.parts.append(
-                f'<figure><img alt="{caption}" src="data:image/png;base64,{data}">'
-                f"<figcaption>{caption}</figcaption></figure>"
-            )
-
-    def body(self) -> str:
-        """Return the page's body with its table of contents under the introduction."""
-        links = "".join(f'<a href="#{name}">{escape(title)}</a>' for name, title in self.sections)
-        first = next((i for i, part in enumerate(self.parts) if part.startswith("<h2")), len(self.parts))
-        return "\n".join([*self.parts[:first], f"<nav>{links}</nav>", *self.parts[first:]])
-
-
 def render(material: Material, pictures: Sequence[Picture]) -> str:
     """Return the report as one HTML page."""
     html = Html()
@@ -190,10 +84,7 @@ def render(material: Material, pictures: Sequence[Picture]) -> str:
         _comparisons(html, material)
         _outliers(html, material)
     _origin(html, material)
-    template = Template(
-        (resources.files(__name__.rpartition(".")[0]) / "report.html").read_text(encoding="utf-8")
-    )
-    return template.substitute(title=escape(material.config.title), body=html.body())
+    return html.page(material.config.title)
 
 
 def _introduction(html: Html, material: Material) -> None:

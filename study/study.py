@@ -16,6 +16,7 @@ import msgspec
 import polars as pl
 
 from ..recording import MarchaError, OutputExists, UsageError
+from ..viz.page import Picture
 from . import analysis, plan
 from . import config as cfg
 from .cells import (
@@ -26,7 +27,7 @@ from .cells import (
 )
 from .executors import Executor
 from .gallery import draw
-from .report import Material, Picture, render
+from .report import Material, render
 from .store import CellStore, tidy, write_atomic
 
 TABLES = ("results", "values", "groups", "comparisons", "outliers", "published", "consistency")
