@@ -1,4 +1,4 @@
-"""The command ``marcha``: parses, calls, prints; the work is done in the other rooms."""
+"""The command ``marcha``: parses, calls, prints; the work is done in the other packages."""
 
 from __future__ import annotations
 

@@ -38,8 +38,8 @@ def align(
     from ..ingest.align import align as run
 
     fit = run(recording, output, segment, overwrite=force)
-    said = (
+    summary = (
         f"offset {fit.offset_s:.6f} s ± {fit.offset_sd_s:.6f}, drift {fit.drift_ppm:.2f} ppm ± {fit.drift_sd_ppm:.2f}, "
         f"r = {fit.correlation:.4f} over {fit.overlap_s:.1f} s"
     )
-    return Outcome({"output": str(output), **msgspec.to_builtins(fit)}, [Heading(f"{output}: {said}")])
+    return Outcome({"output": str(output), **msgspec.to_builtins(fit)}, [Heading(f"{output}: {summary}")])

@@ -7,11 +7,11 @@ from typing import Annotated, Any
 
 from cyclopts import App, Parameter
 
-from .changes import WHERE, Where, diff, log, redo, rules, said, undo, vocabulary, write
+from .changes import WHERE, Where, change_outcome, diff, log, redo, rules, undo, vocabulary, write
 from .console import (
     Heading,
     Outcome,
-    Table,
+    TextTable,
     complain,
 )
 from .contents import say_losses
@@ -199,7 +199,7 @@ def edit(
     values = {k: v for k, v in given.items() if v is not None}
     out = where.target(rec)
     entry = changes.edit(rec, out, ids, values, **where.how)
-    return said(rec, out, entry)
+    return change_outcome(rec, out, entry)
 
 
 @app.command(name="import")
@@ -321,7 +321,7 @@ def list_(path: Path, /, *, tier: Tier = None, common: Common = DEFAULT) -> Outc
         events = events.filter(tier=tier)
     rows = events.rows(named=True)
     optional = [c for c in ("source", "confidence", "note", "channel") if events[c].null_count() < len(rows)]
-    table = Table(
+    table = TextTable(
         ["id", ">onset [s]", ">duration [s]", "tier", "label", *optional, "metadata"],
         [
             [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .console import Heading, Outcome, Table
+from .console import Heading, Outcome, TextTable
 from .options import DEFAULT, Common
 
 
@@ -21,7 +21,7 @@ def formats(*, common: Common = DEFAULT) -> Outcome:
         for name, kind in export.available().items()
     ]
     document = {"importers": readers, "exporters": writers}
-    lines: list[Heading | Table] = []
+    lines: list[Heading | TextTable] = []
     for title, entries in (
         ("convert reads (options: --set)", readers),
         ("export writes (options: --set)", writers),
@@ -30,7 +30,7 @@ def formats(*, common: Common = DEFAULT) -> Outcome:
         for entry in entries:
             lines += [
                 Heading(f"{entry['name']}: {entry['title']}"),
-                Table(
+                TextTable(
                     ["  option", "default", "meaning"],
                     [["  " + o["name"], str(o["default"] or ""), o["description"]] for o in entry["options"]],
                 ),
@@ -71,20 +71,20 @@ def estimators(*names: str, common: Common = DEFAULT) -> Outcome:
         if not names or name in names
     ]
     if not names:
-        listed = Table(
+        listed = TextTable(
             ["calibration (marcha calibrate)", "what it is"], [[c["name"], c["title"]] for c in described]
         )
         lines = [*_overview(entries)[:-1], Heading(""), listed, *_overview(entries)[-1:]]
         return Outcome({"estimators": entries, "calibrations": described}, lines)
     entries += [c | {"offline": False, "presets": {}} for c in described]
-    lines: list[Heading | Table] = []
+    lines: list[Heading | TextTable] = []
     for entry in entries:
         offline = " (offline: needs the whole recording)" if entry["offline"] else ""
         lines.append(Heading(f"{entry['name']}: {entry['title']}{offline}"))
         if entry["source"]:
             lines.append(Heading(f"  source: {entry['source']}"))
         lines.append(
-            Table(
+            TextTable(
                 ["  parameter", ">default", "unit", "range", "meaning"],
                 [
                     [
@@ -105,7 +105,7 @@ def estimators(*names: str, common: Common = DEFAULT) -> Outcome:
     return Outcome({"estimators": entries}, lines)
 
 
-def _overview(entries: list[dict[str, Any]]) -> list[Heading | Table]:
+def _overview(entries: list[dict[str, Any]]) -> list[Heading | TextTable]:
     """Return one line an estimator, and the named parameter sets."""
     rows = [[e["name"], f"{e['title']}{' (offline)' if e['offline'] else ''}"] for e in entries]
     sets: dict[tuple[str, str], list[str]] = {}
@@ -117,9 +117,9 @@ def _overview(entries: list[dict[str, Any]]) -> list[Heading | Table]:
         [preset, chosen, "all" if len(those) == len(entries) else ", ".join(those)]
         for (preset, chosen), those in sets.items()
     ]
-    lines: list[Heading | Table] = [Table(["estimator", "what it is"], rows)]
+    lines: list[Heading | TextTable] = [TextTable(["estimator", "what it is"], rows)]
     if shared:
-        lines += [Heading(""), Table(["preset (-p preset=…)", "sets", "of"], shared)]
+        lines += [Heading(""), TextTable(["preset (-p preset=…)", "sets", "of"], shared)]
     return [
         *lines,
         Heading("\nmarcha estimators NAME… shows the parameters, with units, ranges and defaults"),

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from .console import Heading, Outcome, Table, progress
+from .console import Heading, Outcome, TextTable, progress
 from .errors import DEFECTS, DONE
 from .options import DEFAULT, Common, Force, MaybeOutput, Paths, Strings, instant, settings
 
@@ -76,11 +76,11 @@ def calibrate(
             )
             rp.save_calibration(one, target, overwrite=force)
             written.append(target)
-    lines: list[Heading | Table] = []
+    lines: list[Heading | TextTable] = []
     for one in found:
         verdict = "" if one.usable else ": NOT USABLE"
         lines.append(Heading(f"{one.kind} of {one.subject or 'the recording'}{verdict}"))
-        lines.append(Table(["value", "is"], [(key, _shown(value)) for key, value in one.values.items()]))
+        lines.append(TextTable(["value", "is"], [(key, _shown(value)) for key, value in one.values.items()]))
         lines += [Heading(f"note: {remark}") for remark in one.remarks]
     lines += [Heading(f"written: {path}") for path in written]
     import msgspec

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
-from .console import Heading, Outcome, Table, complain
+from .console import Heading, Outcome, TextTable, complain
 from .contents import say_losses
 from .options import DEFAULT, Common, Shown, Strings, settings
 
@@ -62,10 +62,10 @@ def write(rec: Recording, where: Where, *, more: dict[str, Any] | None = None, *
     from ..recording.changes import change
 
     out = where.target(rec)
-    return said(rec, out, change(rec, out, **what, **where.how), more)
+    return change_outcome(rec, out, change(rec, out, **what, **where.how), more)
 
 
-def said(rec: Recording, out: Path, entry: Change, more: dict[str, Any] | None = None) -> Outcome:
+def change_outcome(rec: Recording, out: Path, entry: Change, more: dict[str, Any] | None = None) -> Outcome:
     """Say what a change did."""
     say_losses(rec)
     total = rec.annotations.height + len(entry.added) - len(entry.removed)
@@ -97,7 +97,7 @@ def log(path: Path, /, *, common: Common = DEFAULT) -> Outcome:
 
     past = history(recording.open(path))
     stands = standing(past)
-    table = Table(
+    table = TextTable(
         [">change", "time", "by", "what", ">added", ">removed"],
         [
             [
@@ -163,7 +163,7 @@ def _back(path: Path, number: int | None, where: Where, *, redo: bool) -> Outcom
 
     rec = recording.open(path)
     out = where.target(rec)
-    return said(rec, out, changes.undo(rec, out, number, redo=redo, **where.how))
+    return change_outcome(rec, out, changes.undo(rec, out, number, redo=redo, **where.how))
 
 
 def rules(
@@ -286,4 +286,4 @@ def diff(
     document = {"first": str(first), "second": str(second or first), "tiers": tiers}
     document |= {"figures": msgspec.to_builtins(figures), "annotations": listing.rows(named=True)}
     rows = [[k, v] for k, v in msgspec.to_builtins(figures).items()]
-    return Outcome(document, [Table(["figure", ">value"], rows)])
+    return Outcome(document, [TextTable(["figure", ">value"], rows)])

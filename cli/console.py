@@ -27,7 +27,7 @@ class Heading:
 
 
 @dataclass(frozen=True)
-class Table:
+class TextTable:
     """Rows under column titles (with units); numbers are aligned right.
 
     Attributes
@@ -53,14 +53,14 @@ class Outcome:
     ----------
     document : dict
         The object that ``--json`` prints.
-    lines : sequence of Heading or Table
+    lines : sequence of Heading or TextTable
         The same for a person.
     code : int
         Exit code.
     """
 
     document: dict[str, Any]
-    lines: Sequence[Heading | Table] = field(default_factory=tuple)
+    lines: Sequence[Heading | TextTable] = field(default_factory=tuple)
     code: int = 0
 
 
@@ -115,7 +115,7 @@ def number(value: Any) -> str:
     return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
 
 
-def folded(table: Table, width: int) -> list[Table]:
+def folded(table: TextTable, width: int) -> list[TextTable]:
     """Return the table in pieces no wider than ``width`` characters, each led by the first column."""
     cells = [
         [title.removeprefix(">") for title in table.columns],
@@ -123,21 +123,21 @@ def folded(table: Table, width: int) -> list[Table]:
     ]
     widths = [max(len(row[k]) for row in cells) + GUTTER for k in range(len(table.columns))]
     groups: list[list[int]] = []
-    room = 0
+    remaining = 0
     for k in range(1, len(widths)):
-        if not groups or widths[k] > room:
+        if not groups or widths[k] > remaining:
             groups.append([0])
-            room = width - widths[0]
+            remaining = width - widths[0]
         groups[-1].append(k)
-        room -= widths[k]
+        remaining -= widths[k]
     return [
-        Table([table.columns[k] for k in group], [[row[k] for k in group] for row in table.rows])
+        TextTable([table.columns[k] for k in group], [[row[k] for k in group] for row in table.rows])
         for group in groups
     ] or [table]
 
 
-def _grid(table: Table, *, colour: bool) -> Any:
-    from rich.table import Table as Grid
+def _grid(table: TextTable, *, colour: bool) -> Any:
+    from rich.table import TextTable as Grid
     from rich.text import Text
 
     grid = Grid(box=None, pad_edge=False, padding=(0, GUTTER, 0, 0), header_style="bold" if colour else "")
@@ -150,11 +150,11 @@ def _grid(table: Table, *, colour: bool) -> Any:
     return grid
 
 
-def columns_of(runs: Iterable[tuple[str, dict[str, Any]]], title: str = "metric") -> Table:
+def columns_of(runs: Iterable[tuple[str, dict[str, Any]]], title: str = "metric") -> TextTable:
     """Return a table with one column a run and one row a figure, in the order of first appearance."""
     runs = list(runs)
     names = list(dict.fromkeys(name for _, figures in runs for name in figures))
-    return Table(
+    return TextTable(
         [title, *(f">{run}" for run, _ in runs)],
         [[name, *(figures.get(name) for _, figures in runs)] for name in names],
         fold=True,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from .console import (
     Heading,
     Outcome,
-    Table,
+    TextTable,
     complain,
 )
 from .errors import DEFECTS, DONE
@@ -44,16 +44,19 @@ def info(path: Path, /, *, common: Common = DEFAULT) -> Outcome:
         "annotations": annotations.height,
         "findings": [finding_entry(f) for f in rec.findings],
     }
-    lines: list[Heading | Table] = [
+    lines: list[Heading | TextTable] = [
         Heading(f"{path}: {rec.duration_s:.3f} s, {len(channels)} channels"),
         channel_table(channels),
     ]
     for name, values in rec.metadata.items():
-        lines += [Heading(f"\n{name}"), Table(["  key", "value"], [["  " + k, v] for k, v in values.items()])]
+        lines += [
+            Heading(f"\n{name}"),
+            TextTable(["  key", "value"], [["  " + k, v] for k, v in values.items()]),
+        ]
     if rec.attachments:
         lines += [
             Heading(""),
-            Table(
+            TextTable(
                 ["attachment", "type", ">bytes"], [[a.name, a.media_type, a.size] for a in rec.attachments]
             ),
         ]
@@ -79,14 +82,14 @@ def channel_entries(rec: Recording) -> list[dict[str, Any]]:
     ]
 
 
-def channel_table(channels: list[dict[str, Any]]) -> Table:
+def channel_table(channels: list[dict[str, Any]]) -> TextTable:
     """Return the channels with their mean rate."""
     rows = []
     for c in channels:
         span_s = (c["end_ns"] - c["start_ns"]) / 1e9 if c["count"] else 0.0
         rate = (c["count"] - 1) / span_s if span_s > 0 else None
         rows.append([c["topic"], c["schema"], c["count"], span_s, rate])
-    return Table(["topic", "schema", ">messages", ">span [s]", ">rate [Hz]"], rows)
+    return TextTable(["topic", "schema", ">messages", ">span [s]", ">rate [Hz]"], rows)
 
 
 def finding_entry(finding: Any) -> dict[str, Any]:
@@ -99,9 +102,9 @@ def finding_entry(finding: Any) -> dict[str, Any]:
     }
 
 
-def finding_table(findings: list[dict[str, Any]]) -> Table:
+def finding_table(findings: list[dict[str, Any]]) -> TextTable:
     """Return findings for a person."""
-    return Table(
+    return TextTable(
         ["finding", ">count", ">first line", "what it means"],
         [[f["kind"], f["count"], f["first_line"], f["detail"]] for f in findings],
     )
@@ -125,7 +128,9 @@ def check(path: Path, /, *, common: Common = DEFAULT) -> Outcome:
     rec = recording.open(path)
     found = [finding_entry(f) for f in examine(rec)]
     imported, lossy = import_report(rec)
-    lines: list[Heading | Table] = [Heading(f"{path}: {'nothing is wrong' if not found else 'look at this'}")]
+    lines: list[Heading | TextTable] = [
+        Heading(f"{path}: {'nothing is wrong' if not found else 'look at this'}")
+    ]
     if found:
         lines.append(finding_table(found))
     if imported:

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from .console import (
     Heading,
     Outcome,
-    Table,
+    TextTable,
     complain,
     progress,
 )
@@ -85,7 +85,7 @@ def convert(
 
 def _one(
     paths: list[Path], output: Path, options: dict[str, Any], common: Common
-) -> tuple[dict[str, Any], list[Heading | Table], int]:
+) -> tuple[dict[str, Any], list[Heading | TextTable], int]:
     from .. import ingest
 
     with progress(f"convert {paths[0].name}", common, counted=True) as report:
@@ -106,7 +106,7 @@ def _one(
         "channels": channels,
         "report": {**rows, "findings": found},
     }
-    lines: list[Heading | Table] = [
+    lines: list[Heading | TextTable] = [
         Heading(f"{made.output} ({made.format})"),
         channel_table(channels),
         Heading(
@@ -130,21 +130,21 @@ def _each(paths: tuple[Path, ...], folder: Path, options: dict[str, Any], common
     names = _names(logs)
     folder.mkdir(parents=True, exist_ok=True)
     conversions: list[dict[str, Any]] = []
-    lines: list[Heading | Table] = []
+    lines: list[Heading | TextTable] = []
     codes = []
     for log in logs:
         output = folder / names[log]
         try:
-            document, said, code = _one([log], output, options, common)
+            document, text_lines, code = _one([log], output, options, common)
         except Exception as error:
             known = expected(error)
             if known is None:
                 raise
             line, code = known
             complain(line)
-            document, said = {"output": None, "error": line, "exit_code": code}, []
+            document, text_lines = {"output": None, "error": line, "exit_code": code}, []
         conversions.append({"input": str(log), **document})
-        lines += said
+        lines += text_lines
         codes.append(code)
     lines += [Heading(f"skipped {path}: {reason}") for path, reason in skipped]
     done = sum(code in (DONE, DEFECTS) for code in codes)

@@ -11,7 +11,7 @@ from cyclopts import Parameter
 from .console import (
     Heading,
     Outcome,
-    Table,
+    TextTable,
     columns_of,
     number,
 )
@@ -146,7 +146,7 @@ def _walk(
     }
 
 
-def _table(walk: dict[str, Any]) -> Table:
+def _table(walk: dict[str, Any]) -> TextTable:
     return columns_of(
         (r["estimator"], {m: r["metrics"][m] for m in FIGURES if m in r["metrics"]}) for r in walk["runs"]
     )

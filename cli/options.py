@@ -53,7 +53,7 @@ _UNIT_NS = {
 
 
 def settings(pairs: tuple[str, ...], option: str) -> dict[str, str]:
-    """Return ``k=v`` pairs as a dict; the room that takes them gives the values their types.
+    """Return ``k=v`` pairs as a dict; the package that takes them gives the values their types.
 
     Raises
     ------

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from .console import (
     Heading,
     Outcome,
-    Table,
+    TextTable,
     columns_of,
     progress,
 )
@@ -131,8 +131,8 @@ def replay(
         "rrd": str(rrd) if rrd else None,
         "runs": runs,
     }
-    lines: list[Heading | Table] = [
-        Table(
+    lines: list[Heading | TextTable] = [
+        TextTable(
             ["run", "estimator", "input", ">samples", ">loop [s]"],
             [[r["run"], r["estimator"], r["input"], r["samples"], r["loop_s"]] for r in runs],
         ),
@@ -151,12 +151,12 @@ def _figures(run: dict[str, Any]) -> dict[str, Any]:
 
 def _remarks(runs: list[dict[str, Any]]) -> list[Heading]:
     """Return what the user must know; what holds for every run of an input is said once."""
-    said: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    runs_of: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for run in runs:
         for finding in run["findings"]:
-            said.setdefault((finding["kind"], finding["detail"]), []).append(run)
+            runs_of.setdefault((finding["kind"], finding["detail"]), []).append(run)
     lines = []
-    for (kind, detail), those in said.items():
+    for (kind, detail), those in runs_of.items():
         inputs = list(dict.fromkeys(run["input"] for run in those))
         all_of_them = len(those) > 1 and len(those) == sum(run["input"] in inputs for run in runs)
         whom = ", ".join(inputs if all_of_them else [run["run"] for run in those])
@@ -224,7 +224,7 @@ def evaluate(
         )
         for r in runs
     ]
-    lines: list[Heading | Table] = [columns_of(figures)]
+    lines: list[Heading | TextTable] = [columns_of(figures)]
     lines += [Heading(f"{r['run']}: {r['note']}") for r in runs if r["note"]]
     for tier, label in dict.fromkeys((i["tier"], i["label"]) for r in runs for i in r["intervals"]):
         lines += [Heading(f"\n{tier}: {label}"), columns_of(_within(runs, tier, label))]

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from .console import (
     Heading,
     Outcome,
-    Table,
+    TextTable,
     progress,
 )
 from .options import (
@@ -84,8 +84,8 @@ def tune(
         "points": table.to_dicts(),
     }
     best = ",".join(f"{key}={value}" for key, value in tuned.params.items())
-    lines: list[Heading | Table] = [
-        Table([*searched, *(f">{c}" for c in figures)], table.head(20).rows()),
+    lines: list[Heading | TextTable] = [
+        TextTable([*searched, *(f">{c}" for c in figures)], table.head(20).rows()),
         *([Heading(f"… and {table.height - 20} more (--json has all)")] if table.height > 20 else []),
         Heading(""),
         Heading(

@@ -16,7 +16,7 @@ import marcha.recording as mr
 import marcha.replay as rp
 import marcha.viz as viz
 from marcha.ingest.simulate import simulate
-from marcha.viz.screenshot import Picture, screenshots
+from marcha.viz.screenshot import Screenshot, screenshots
 
 IMAGES = Path(__file__).parent / "images"
 SENSOR = "/foot/imu2"
@@ -35,7 +35,7 @@ def replayed(folder: Path, scenario: str, estimators: tuple[str, ...], name: str
     return mr.open(folder / f"{name}.mcap")
 
 
-def save(picture: Picture, path: Path) -> None:
+def save(picture: Screenshot, path: Path) -> None:
     """Write a picture without the window's bar."""
     from PIL import Image
 

@@ -176,12 +176,12 @@ def _kappa(a: pl.DataFrame, b: pl.DataFrame, span: tuple[int, int]) -> tuple[flo
     time = np.diff(edges).astype(float)
     if not time.sum():
         return math.nan, math.nan
-    said = [_categories(t, edges) for t in (a, b)]
+    labelled = [_categories(t, edges) for t in (a, b)]
     weight = time / time.sum()
-    agreed = float(weight[[x == y for x, y in zip(*said, strict=True)]].sum())
+    agreed = float(weight[[x == y for x, y in zip(*labelled, strict=True)]].sum())
     chance = 0.0
-    shares = [dict.fromkeys(set(said[0]) | set(said[1]), 0.0) for _ in said]
-    for share, categories in zip(shares, said, strict=True):
+    shares = [dict.fromkeys(set(labelled[0]) | set(labelled[1]), 0.0) for _ in labelled]
+    for share, categories in zip(shares, labelled, strict=True):
         for category, w in zip(categories, weight.tolist(), strict=True):
             share[category] += w
     chance = sum(shares[0][c] * shares[1][c] for c in shares[0])

@@ -69,12 +69,12 @@ class BidsExporter:
             for t in selected_topics(rec, options)
             if rec.channels[t].schema != EVENT and not numeric_columns(rec, t)
         ]
-        said = ["line breaks and tabs in labels: they are written as signs"]
+        losses = ["line breaks and tabs in labels: they are written as signs"]
         if odd:
-            said.append(f"channels without numbers: {', '.join(odd)}")
+            losses.append(f"channels without numbers: {', '.join(odd)}")
         if rec.attachments:
-            said.append(f"{len(rec.attachments)} attachments")
-        return said
+            losses.append(f"{len(rec.attachments)} attachments")
+        return losses
 
     def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:
         """Write the dataset; see :class:`marcha.export.Exporter`."""

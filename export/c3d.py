@@ -55,22 +55,22 @@ class C3dExporter:
     def losses(self, rec: Recording, options: Any) -> list[str]:
         """Return what has no place, or only rounded, in the file; the side file names it."""
         points, analog = self._data(rec, options)
-        said = ["64-bit numbers: values are 32-bit, times a frame number; the date and the clock are lost"]
+        losses = ["64-bit numbers: values are 32-bit, times a frame number; the date and the clock are lost"]
         for data in (points, analog):
             if data is not None and data.resampled:
-                said.append(
+                losses.append(
                     f"several clocks: {', '.join(data.resampled)} are interpolated to the times of the others"
                 )
         if points is None and analog is not None and evenness(analog.t_ns) > EVEN:
-            said.append("uneven times: readings are interpolated to even ones")
+            losses.append("uneven times: readings are interpolated to even ones")
         if points is not None and evenness(points.t_ns) > EVEN:
-            said.append("uneven times: frames are numbered, gaps in time are lost")
+            losses.append("uneven times: frames are numbered, gaps in time are lost")
         if points is not None and analog is not None:
-            said.append(
+            losses.append(
                 "readings between frames: analog channels are interpolated to a multiple of the frame rate"
             )
         if rec.annotations.height:
-            said.append(
+            losses.append(
                 "ends of annotations: an interval becomes two events, LABEL and LABEL end; the rest is in the side file"
             )
         others = [
@@ -79,8 +79,8 @@ class C3dExporter:
             if c.schema != EVENT and not any(d is not None and t in d.columns for d in (points, analog))
         ]
         if others:
-            said.append(f"{len(others)} other channels")
-        return said
+            losses.append(f"{len(others)} other channels")
+        return losses
 
     def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:
         """Write the file and its side file; see :class:`marcha.export.Exporter`."""

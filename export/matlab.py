@@ -36,12 +36,12 @@ class MatlabExporter:
     def losses(self, rec: Recording, options: Any) -> list[str]:
         """Return what is renamed, and what is left out."""
         selected_topics(rec, options)
-        said = [
+        losses = [
             "topics and columns as they are: names are made valid in MATLAB; topic, units and columns say so"
         ]
         if rec.attachments:
-            said.append(f"{len(rec.attachments)} attachments")
-        return said
+            losses.append(f"{len(rec.attachments)} attachments")
+        return losses
 
     def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:
         """Write the file; see :class:`marcha.export.Exporter`."""

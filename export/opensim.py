@@ -64,12 +64,14 @@ class OpensimExporter:
     def losses(self, rec: Recording, options: Any) -> list[str]:
         """Return what has no place in the file; the side file names it."""
         topics = self._topics(rec, options)
-        said = [f"anything but {self.what}: {len(rec.channels) - len(topics)} channels are left out"]
+        losses = [f"anything but {self.what}: {len(rec.channels) - len(topics)} channels are left out"]
         resampled = together(rec, topics, options).resampled
         if resampled:
-            said.append(f"several clocks: {', '.join(resampled)} are interpolated to the times of the others")
-        said.append("the date: time counts from the recording's start")
-        return said
+            losses.append(
+                f"several clocks: {', '.join(resampled)} are interpolated to the times of the others"
+            )
+        losses.append("the date: time counts from the recording's start")
+        return losses
 
     def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:
         """Write the file and its side file; see :class:`marcha.export.Exporter`."""

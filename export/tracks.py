@@ -43,7 +43,7 @@ class TrackOptions(Selection, frozen=True, kw_only=True, forbid_unknown_fields=T
     move_north_m: Annotated[float, msgspec.Meta(description="move everything north by so much [m]")] = 0.0
 
 
-class Track(NamedTuple):
+class FixTrack(NamedTuple):
     """One channel of fixes: rows with a position, times as text or None where the clock tells no date."""
 
     topic: str
@@ -51,7 +51,7 @@ class Track(NamedTuple):
     times: list[str] | None
 
 
-def tracks_of(rec: Recording, options: TrackOptions) -> list[Track]:
+def tracks_of(rec: Recording, options: TrackOptions) -> list[FixTrack]:
     """Return the tracks that a selection means.
 
     Raises
@@ -67,7 +67,7 @@ def tracks_of(rec: Recording, options: TrackOptions) -> list[Track]:
         table = table.filter(pl.col("lat_deg").is_finite() & pl.col("lon_deg").is_finite())
         table = _private(table, options)
         dated = table.height and int(table["t_ns"][0]) > _EPOCH_NS
-        out.append(Track(topic, table, [_iso(t) for t in table["t_ns"].to_list()] if dated else None))
+        out.append(FixTrack(topic, table, [_iso(t) for t in table["t_ns"].to_list()] if dated else None))
     if not any(track.table.height for track in out):
         raise UsageError(f"{rec.path}: no fixes are left to write; choose topics of {FIX}, or less privacy")
     return out
@@ -127,26 +127,26 @@ class TrackExporter:
     Options: ClassVar[type[msgspec.Struct]] = TrackOptions
 
     @abstractmethod
-    def text(self, rec: Recording, tracks: list[Track], options: TrackOptions) -> str:
+    def text(self, rec: Recording, tracks: list[FixTrack], options: TrackOptions) -> str:
         """Return the file."""
 
     def losses(self, rec: Recording, options: Any) -> list[str]:
         """Return what is not a track, and what is unsure of those that are."""
         topics = [t for t, c in rec.channels.items() if c.schema != FIX]
-        said = [f"{len(topics)} channels that are no fixes"] if topics else []
+        losses = [f"{len(topics)} channels that are no fixes"] if topics else []
         tracks = tracks_of(rec, options)
         if any(track.times is None for track in tracks):
-            said.append("dates: the recording's clock tells none, so that points have no time")
+            losses.append("dates: the recording's clock tells none, so that points have no time")
         if any(_numbers(track.table, "alt_m") for track in tracks):
-            said.append(
+            losses.append(
                 "heights above sea level: heights are those that the device states, above the ellipsoid"
             )
         if private := _privacy(options):
-            said.append(
+            losses.append(
                 "true positions: changed for privacy by "
                 + ", ".join(f"{k} = {v:g}" for k, v in private.items())
             )
-        return said
+        return losses
 
     def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:
         """Write the file; see :class:`marcha.export.Exporter`."""
@@ -168,7 +168,7 @@ class GpxExporter(TrackExporter):
     title = "GPX 1.1 of fixes, with times and accuracies (maps, watches, OpenStreetMap)"
     suffix = ".gpx"
 
-    def text(self, rec: Recording, tracks: list[Track], options: TrackOptions) -> str:
+    def text(self, rec: Recording, tracks: list[FixTrack], options: TrackOptions) -> str:
         """Return the file."""
         about = _about(rec, options)
         out = [
@@ -203,7 +203,7 @@ class GeoJsonExporter(TrackExporter):
     title = "GeoJSON of fixes, times and accuracies as properties (QGIS, web maps)"
     suffix = ".geojson"
 
-    def text(self, rec: Recording, tracks: list[Track], options: TrackOptions) -> str:
+    def text(self, rec: Recording, tracks: list[FixTrack], options: TrackOptions) -> str:
         """Return the file."""
         features = []
         for track in tracks:
@@ -236,7 +236,7 @@ class KmlExporter(TrackExporter):
     title = "KML of fixes, times and accuracies (Google Earth)"
     suffix = ".kml"
 
-    def text(self, rec: Recording, tracks: list[Track], options: TrackOptions) -> str:
+    def text(self, rec: Recording, tracks: list[FixTrack], options: TrackOptions) -> str:
         """Return the file."""
         about = escape(json.dumps(_about(rec, options), ensure_ascii=False))
         out = [

@@ -168,9 +168,9 @@ def align(source: Path | str, out: Path | str, segment: str, *, overwrite: bool 
         for name, record in rec.metadata.items():
             if name != "clocks":
                 written.add_metadata(name, dict(record))
-        said = {k: f"{v:.9g}" for k, v in msgspec.to_builtins(fit).items()}
+        fitted = {k: f"{v:.9g}" for k, v in msgspec.to_builtins(fit).items()}
         topics = ", ".join(sorted(moved))
-        written.add_metadata("alignment", {"method": "rates", "segment": segment, "moved": topics, **said})
+        written.add_metadata("alignment", {"method": "rates", "segment": segment, "moved": topics, **fitted})
     return fit
 
 

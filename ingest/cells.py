@@ -12,7 +12,7 @@ import polars as pl
 
 from ..recording.errors import MarchaError
 from .contract import ReportBuilder
-from .mapping import Layout
+from .mapping import TextLayout
 from .text import BOM, read_blocks, shown
 
 
@@ -23,7 +23,7 @@ class Cells:
     ----------
     path : Path
         The file.
-    layout : Layout
+    layout : TextLayout
         How it is laid out.
 
     Raises
@@ -32,7 +32,7 @@ class Cells:
         The file cannot be read, is empty or ends before its first row.
     """
 
-    def __init__(self, path: Path, layout: Layout) -> None:
+    def __init__(self, path: Path, layout: TextLayout) -> None:
         self.path = path
         self._layout = layout
         self._separator = b"\t" if layout.separator == "blanks" else layout.separator.encode("ascii")

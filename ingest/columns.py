@@ -15,7 +15,7 @@ import polars as pl
 from ..recording.errors import MarchaError
 from .cells import Cells
 from .contract import HEAD_BYTES, ReportBuilder
-from .mapping import Layout
+from .mapping import TextLayout
 from .text import read_blocks
 
 PREAMBLE_LINES = 200
@@ -119,7 +119,9 @@ def float_blocks(
         The file ends with its header, or its rows do not fit it.
     """
     headed = header.line > 0
-    cells = Cells(path, Layout(separator=header.separator, skip_rows=max(header.line - 1, 0), header=headed))
+    cells = Cells(
+        path, TextLayout(separator=header.separator, skip_rows=max(header.line - 1, 0), header=headed)
+    )
     if not headed and cells.width != len(header.names):
         raise MarchaError(f"{path}: its first row has {cells.width} cells, not {len(header.names)}")
     if headed and tuple(cells.names) != header.names:

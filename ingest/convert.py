@@ -14,7 +14,7 @@ import polars as pl
 from .. import recording as mr
 from ..recording.errors import MarchaError, OutputExists, UsageError
 from ..recording.provenance import provenance
-from ..recording.threads import Ahead, helpers
+from ..recording.threads import Prefetch, helpers
 from . import registry
 from .archive import UNPACK_LIMIT_GB
 from .contract import (
@@ -26,7 +26,7 @@ from .contract import (
 )
 from .legchecks import LegWatch
 from .mapping import mapping_format
-from .truth import Truth, as_text, read_truth
+from .truth import TruthFile, as_text, read_truth
 
 T = TypeVar("T")
 
@@ -152,9 +152,9 @@ class _Merged:
 
     def add(
         self,
-        source: registry.Chosen,
+        source: registry.ChosenSource,
         options: CommonOptions,
-        truth: Truth | None,
+        truth: TruthFile | None,
         imported: Import,
         written: _Writer,
     ) -> None:
@@ -164,7 +164,7 @@ class _Merged:
         for spec in imported.channels:
             written.declare(spec)
         watch = LegWatch(imported.channels)
-        with contextlib.closing(Ahead(imported.blocks(), "parse")) as blocks:
+        with contextlib.closing(Prefetch(imported.blocks(), "parse")) as blocks:
             for topic, table in blocks:
                 watch.feed(topic, table)
                 written.add(topic, table)
@@ -297,7 +297,7 @@ def _instant(option: str, text: str) -> int:
 def _metadata(
     imported: Import,
     options: CommonOptions,
-    truth: Truth | None,
+    truth: TruthFile | None,
 ) -> dict[str, dict[str, str]]:
     records = {name: dict(record) for name, record in imported.metadata.items()}
     if options.epoch is not None or options.start is not None:
@@ -311,7 +311,7 @@ def _metadata(
     return records
 
 
-def _read(files: Sequence[Path], truth: Truth | None) -> Iterator[Path]:
+def _read(files: Sequence[Path], truth: TruthFile | None) -> Iterator[Path]:
     """Yield every file that a source is read from."""
     yield from (p for _, p in _files([*files, *(truth.files if truth else ())]))
 

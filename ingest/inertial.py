@@ -15,8 +15,8 @@ import polars as pl
 
 from ..recording.errors import MarchaError, UsageError
 from .checks import STANDARD_GRAVITY, SensorCheck
-from .clock import Clock
 from .contract import ChannelSpec, ReportBuilder
+from .timestamps import TimestampRepair
 from .units import conversion
 
 IMU = "sensor_msgs/msg/Imu"
@@ -49,14 +49,14 @@ MIRRORS = {"x": (-1.0, 1.0, 1.0), "y": (1.0, -1.0, 1.0), "none": (1.0, 1.0, 1.0)
 """Factors of a reference's x, y, z."""
 
 
-class Source(NamedTuple):
+class SourceColumn(NamedTuple):
     """Where a column comes from: the name in the header and the factor to SI."""
 
     name: str
     factor: float
 
 
-def x_io_columns(path: Path, names: Sequence[str], line: int) -> dict[str, Source]:
+def x_io_columns(path: Path, names: Sequence[str], line: int) -> dict[str, SourceColumn]:
     """Return the columns that x-io's headers name (``Gyroscope X (deg/s)``), and ``t`` of ``Time (s)``.
 
     A magnetometer in arbitrary units is none.
@@ -66,7 +66,7 @@ def x_io_columns(path: Path, names: Sequence[str], line: int) -> dict[str, Sourc
     MarchaError
         The unit of an acceleration, angular rate or time is unknown.
     """
-    found: dict[str, Source] = {}
+    found: dict[str, SourceColumn] = {}
     for name in names:
         match = _CELL.fullmatch(name)
         if match is None:
@@ -87,17 +87,17 @@ def x_io_columns(path: Path, names: Sequence[str], line: int) -> dict[str, Sourc
             raise MarchaError(
                 f"{path}, line {line}: column {name!r}: {error}; or import it with --map"
             ) from None
-        found[column] = Source(name, scale)
+        found[column] = SourceColumn(name, scale)
     return found
 
 
 @dataclass(frozen=True)
-class Plan:
+class ChannelColumns:
     """Channels of a headed CSV: topic and schema, and the sources of the schema's columns."""
 
     topic: str
     schema: str
-    columns: Mapping[str, Source]
+    columns: Mapping[str, SourceColumn]
     frame_id: str = "imu"
     metadata: Mapping[str, str] | None = None
     held: bool = False
@@ -108,7 +108,7 @@ class Plan:
         return ChannelSpec(self.topic, self.schema, self.frame_id, metadata=dict(self.metadata or {}))
 
 
-def complete(columns: Mapping[str, Source], axes: Sequence[str]) -> dict[str, Source]:
+def complete(columns: Mapping[str, SourceColumn], axes: Sequence[str]) -> dict[str, SourceColumn]:
     """Return the three axes of one sensor; empty where one is missing."""
     return {a: columns[a] for a in axes} if all(a in columns for a in axes) else {}
 
@@ -151,8 +151,8 @@ def one_file(paths: Sequence[Path], name: str) -> Path:
 def tables(
     path: Path,
     frames: Iterable[pl.DataFrame],
-    plans: Sequence[Plan],
-    clock: Clock,
+    plans: Sequence[ChannelColumns],
+    clock: TimestampRepair,
     report: ReportBuilder,
     *,
     limits: Mapping[str, tuple[float, float, str]] | None = None,
@@ -165,9 +165,9 @@ def tables(
         The source, for messages.
     frames : iterable of polars.DataFrame
         ``t`` (Int64, ticks of ``clock``), ``line``, and the cells under the header's names (Float64).
-    plans : sequence of Plan
+    plans : sequence of ChannelColumns
         Channels to make; the Imu is the first.
-    clock : Clock
+    clock : TimestampRepair
         Repairs and stamps.
     report : ReportBuilder
         Takes what is found.
@@ -221,7 +221,7 @@ def _with_end(frames: Iterable[pl.DataFrame]) -> Iterator[tuple[pl.DataFrame | N
     yield None, True
 
 
-def _missing(frame: pl.DataFrame, plans: Sequence[Plan], report: ReportBuilder) -> None:
+def _missing(frame: pl.DataFrame, plans: Sequence[ChannelColumns], report: ReportBuilder) -> None:
     for plan in plans:
         for source in plan.columns.values():
             gone = np.flatnonzero(np.isnan(frame[source.name].to_numpy()))
@@ -236,7 +236,11 @@ def _missing(frame: pl.DataFrame, plans: Sequence[Plan], report: ReportBuilder) 
 
 
 def _fresh(
-    table: pl.DataFrame, last: dict[str, pl.DataFrame], plan: Plan, report: ReportBuilder, lines: np.ndarray
+    table: pl.DataFrame,
+    last: dict[str, pl.DataFrame],
+    plan: ChannelColumns,
+    report: ReportBuilder,
+    lines: np.ndarray,
 ) -> pl.DataFrame:
     """Return the rows whose reading differs from the one before."""
     columns = list(plan.columns)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..recording.errors import MarchaError, UsageError
 from .contract import ReportBuilder
-from .mapping import Cell, Topic
+from .mapping import CellSource, Topic
 
 FloatArray = NDArray[np.float64]
 
@@ -85,7 +85,7 @@ def plain_name(text: str) -> str:
     return name if name[:1].isalpha() else f"imu_{name}"
 
 
-def vector_topic(name: str, schema: str, columns: dict[str, Cell | str | int], **more: object) -> Topic:
+def vector_topic(name: str, schema: str, columns: dict[str, CellSource | str | int], **more: object) -> Topic:
     """Return a topic of a mapping; shorthand."""
     return Topic(name=name, schema=schema, columns=columns, **more)  # pyright: ignore[reportArgumentType]
 
@@ -167,7 +167,7 @@ def marker_names(columns: Iterable[str]) -> list[str]:
     return [c.removesuffix(".x") for c in columns if c.endswith(".x")]
 
 
-def marker_columns(names: Sequence[str], first: int) -> dict[str, Cell | str | int]:
+def marker_columns(names: Sequence[str], first: int) -> dict[str, CellSource | str | int]:
     """Return the mapping of markers whose x, y, z stand one after the other from column ``first`` (from 1)."""
     return {f"{n}.{a}": first + 3 * k + j for k, n in enumerate(names) for j, a in enumerate("xyz")}
 

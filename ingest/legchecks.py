@@ -212,16 +212,16 @@ def _swapped(sensors: Mapping[str, _Sensor], report: ReportBuilder) -> None:
         posture = {name: s.turn(1.5) for name, s in ((topic, upper), (other, lower))}
         if max(posture.values()) > POSTURE_RAD:
             swapped = posture[other] > SWAP_RATIO * posture[topic] > SWAP_RATIO * np.radians(8.0)
-            said = [f"{np.degrees(posture[name]):.0f}°" for name in (topic, other)]
+            values = [f"{np.degrees(posture[name]):.0f}°" for name in (topic, other)]
             why = "changes of posture turn gravity by {} in the thigh's and {} in the shank's"
         else:
             swapped = upper.rate > MOVING_RATE and upper.rate > SWAP_RATIO * lower.rate
-            said = [f"{s.rate:.2g} rad/s" for s in (upper, lower)]
+            values = [f"{s.rate:.2g} rad/s" for s in (upper, lower)]
             why = "swinging legs turn at {} (rms) in the thigh's and {} in the shank's"
         if swapped:
             report.note(
                 "swapped",
-                f"{topic}, {other}: {why.format(*said)} sensor, as if they were exchanged: check which sits where",
+                f"{topic}, {other}: {why.format(*values)} sensor, as if they were exchanged: check which sits where",
                 count=2,
                 subject=topic,
             )

@@ -20,7 +20,7 @@ class Strict(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """Base of the mapping's tables: an unknown key is an error."""
 
 
-class Layout(Strict, frozen=True, kw_only=True):
+class TextLayout(Strict, frozen=True, kw_only=True):
     """How the text is laid out.
 
     Attributes
@@ -83,7 +83,7 @@ class Time(Strict, frozen=True, kw_only=True):
     even: bool = True
 
 
-class Cell(Strict, frozen=True, kw_only=True):
+class CellSource(Strict, frozen=True, kw_only=True):
     """Where a column of a channel comes from: a column of the table, or a constant.
 
     The value is ``(cell · unit) · scale + offset``; ``offset`` is in the recording's unit.
@@ -134,7 +134,7 @@ class Topic(Strict, frozen=True, kw_only=True):
 
     name: Annotated[str, msgspec.Meta(pattern="^/[^ ]+$")]
     schema: str
-    columns: dict[str, Cell | str | int]
+    columns: dict[str, CellSource | str | int]
     units: dict[str, str] = {}
     frame: str = ""
     file: str | None = None
@@ -148,7 +148,7 @@ class Mapping(Strict, frozen=True, kw_only=True):
 
     topic: Annotated[list[Topic], msgspec.Meta(min_length=1)]
     time: Time
-    layout: Layout = Layout()
+    layout: TextLayout = TextLayout()
     device: dict[str, str] = {}
 
 
@@ -253,7 +253,7 @@ def targets(path: Path, mapping: Mapping, index: int, topic: Topic) -> list[Targ
     found = []
     for name, given in topic.columns.items():
         key = f"{where}.columns.{name}"
-        cell = given if isinstance(given, Cell) else Cell(column=given)
+        cell = given if isinstance(given, CellSource) else CellSource(column=given)
         column = _column(name, schema.columns, bool(schema.names))
         if column is None:
             known = ", ".join(c.name or "<name>" for c in schema.columns)

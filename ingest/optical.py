@@ -10,10 +10,10 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ..recording.errors import MarchaError
-from .clock import Clock
 from .columns import MISSING
 from .contract import ChannelSpec, Import, ReportBuilder
 from .leg import MARKERS, MARKERS_TOPIC, unseen
+from .timestamps import TimestampRepair
 
 FloatArray = NDArray[np.float64]
 ROWS = 8192
@@ -135,7 +135,7 @@ def blocks_of(
     """
     wide = [table.rename({c: f"{k} {c}" for c in table.columns}) for k, (_, table) in enumerate(tables)]
     frame = pl.DataFrame({"t": t_ns, "line": lines}).hstack([c for t in wide for c in t.get_columns()])
-    clock = Clock(report, tick_ns=1)
+    clock = TimestampRepair(report, tick_ns=1)
     for block in clock.stream(frame[i : i + ROWS] for i in range(0, frame.height, ROWS)):
         for k, (topic, table) in enumerate(tables):
             yield topic, block.select("t_ns", *(pl.col(f"{k} {c}").alias(c) for c in table.columns))

@@ -17,10 +17,10 @@ import polars as pl
 
 from ..recording.errors import MarchaError
 from .checks import SensorCheck, check_plausible
-from .clock import Clock
 from .contract import ChannelSpec, ReportBuilder, SourceAttachment
-from .inertial import ACC, GYR, IMU, MAG, Plateau, Source
+from .inertial import ACC, GYR, IMU, MAG, Plateau, SourceColumn
 from .inertial import FIELD as FIELD
+from .timestamps import TimestampRepair
 
 FIX = "sensor_msgs/msg/NavSatFix"
 PRESSURE = "sensor_msgs/msg/FluidPressure"
@@ -47,7 +47,7 @@ Make = Callable[[pl.DataFrame], Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
-class Part:
+class StreamChannel:
     """One channel of a stream.
 
     Attributes
@@ -68,7 +68,7 @@ class Part:
 
     topic: str
     schema: str
-    columns: Mapping[str, Source] | Make
+    columns: Mapping[str, SourceColumn] | Make
     names: tuple[str, ...] = ()
     held: bool = False
     fixes: bool = False
@@ -86,22 +86,22 @@ class Part:
         )
 
 
-def xyz(columns: Sequence[str], names: Sequence[str], factor: float = 1.0) -> dict[str, Source]:
+def xyz(columns: Sequence[str], names: Sequence[str], factor: float = 1.0) -> dict[str, SourceColumn]:
     """Return the sources of three axes."""
-    return {c: Source(n, factor) for c, n in zip(columns, names, strict=True)}
+    return {c: SourceColumn(n, factor) for c, n in zip(columns, names, strict=True)}
 
 
-def imu_part(topic: str, columns: Mapping[str, Source], **metadata: str) -> Part:
+def imu_part(topic: str, columns: Mapping[str, SourceColumn], **metadata: str) -> StreamChannel:
     """Return the channel of an accelerometer, a gyroscope or both."""
-    return Part(topic, IMU, columns, metadata=metadata)
+    return StreamChannel(topic, IMU, columns, metadata=metadata)
 
 
-def fix_part(columns: Mapping[str, str], topic: str = "/phone/gnss", **metadata: str) -> Part:
+def fix_part(columns: Mapping[str, str], topic: str = "/phone/gnss", **metadata: str) -> StreamChannel:
     """Return the channel of fixes from ``lat, lon, alt, accuracy, vertical`` and the names of their cells."""
-    return Part(
+    return StreamChannel(
         topic,
         FIX,
-        {k: Source(v, 1.0) for k, v in columns.items()},
+        {k: SourceColumn(v, 1.0) for k, v in columns.items()},
         held=True,
         fixes=True,
         frame_id="wgs84",
@@ -143,7 +143,7 @@ class Stream:
 
     Parameters
     ----------
-    parts : sequence of Part
+    parts : sequence of StreamChannel
         Channels that the rows give.
     report : ReportBuilder
         Takes what is found.
@@ -160,7 +160,7 @@ class Stream:
 
     def __init__(
         self,
-        parts: Sequence[Part],
+        parts: Sequence[StreamChannel],
         report: ReportBuilder,
         *,
         subject: str = "",
@@ -171,7 +171,7 @@ class Stream:
         self.attachments = attachments if attachments is not None else []
         self.parts = list(parts)
         self._report = report
-        self._clock = Clock(report, tick_ns=1, subject=f"{subject}: " if subject else "", even=even)
+        self._clock = TimestampRepair(report, tick_ns=1, subject=f"{subject}: " if subject else "", even=even)
         self._subject = subject
         self._events: list[pl.DataFrame] | None = [] if events else None
         self._checks = {p.topic: _Check(p, report) for p in self.parts if p.schema == IMU}
@@ -240,7 +240,7 @@ class Stream:
             elif table.height:
                 yield part.topic, table.drop("line")
 
-    def _table(self, part: Part, frame: pl.DataFrame) -> pl.DataFrame:
+    def _table(self, part: StreamChannel, frame: pl.DataFrame) -> pl.DataFrame:
         if callable(part.columns):
             made = pl.DataFrame({k: pl.Series(k, v, strict=False) for k, v in part.columns(frame).items()})
         else:
@@ -259,7 +259,7 @@ class Stream:
             check_plausible(self._report, part.topic, columns, table["line"].to_numpy())
         return table
 
-    def _present(self, part: Part, table: pl.DataFrame) -> pl.DataFrame:
+    def _present(self, part: StreamChannel, table: pl.DataFrame) -> pl.DataFrame:
         """Return the rows that hold a reading; report those that lack a part of one."""
         keys = ["lat", "lon"] if part.fixes else [c for c in table.columns[2:] if table[c].dtype.is_float()]
         if not keys or part.schema in (RADIO, STEP):
@@ -287,7 +287,7 @@ class Stream:
             )
         return table.filter(pl.Series(np.asarray(~empty))) if empty.any() else table
 
-    def _fresh(self, part: Part, table: pl.DataFrame) -> pl.DataFrame:
+    def _fresh(self, part: StreamChannel, table: pl.DataFrame) -> pl.DataFrame:
         """Return the rows whose reading differs from the one before."""
         values = np.column_stack([table[c].to_numpy() for c in table.columns[2:]])
         before = self._last.get(part.topic)
@@ -312,7 +312,7 @@ class Stream:
 class _Check:
     """Checks of an inertial channel: units, silence, clipping, gravity."""
 
-    def __init__(self, part: Part, report: ReportBuilder) -> None:
+    def __init__(self, part: StreamChannel, report: ReportBuilder) -> None:
         self._report, self._topic = report, part.topic
         columns = part.names if callable(part.columns) else tuple(part.columns)
         self._axes = [a for a in (*ACC, *GYR) if a in columns]

@@ -144,8 +144,8 @@ def make_options(importer: Importer, values: Mapping[str, Any]) -> CommonOptions
             msgspec.convert({key: value}, importer.Options, strict=False)
         except msgspec.ValidationError as error:
             if f"$.{key}" in str(error):
-                said = str(error).split(" - at ")[0]
-                raise UsageError(f"format {importer.name}: option {key}={value!r}: {said}") from None
+                reason = str(error).split(" - at ")[0]
+                raise UsageError(f"format {importer.name}: option {key}={value!r}: {reason}") from None
     try:
         return msgspec.convert(dict(values), importer.Options, strict=False)
     except msgspec.ValidationError as error:
@@ -173,7 +173,7 @@ def recognise(path: Path) -> list[Candidate]:
     return sorted(found, key=lambda c: -c.confidence)
 
 
-class Chosen(NamedTuple):
+class ChosenSource(NamedTuple):
     """One source of a recording: an importer and the files or folders that it reads together."""
 
     registered: Registered
@@ -187,7 +187,7 @@ def choose(
     *,
     mapped: str | None = None,
     unpack_limit_gb: float = UNPACK_LIMIT_GB,
-) -> list[Chosen]:
+) -> list[ChosenSource]:
     """Find the importers of a recording's sources, and the files or folders to hand to each.
 
     A folder is first offered whole, then its files; a zip archive is unpacked and taken for a folder. Inputs
@@ -221,14 +221,14 @@ def choose(
             chosen.append((mapped, Path(path)))
         else:
             chosen += _resolve(Path(path), wanted, stack, unpack_limit_gb)
-    sources: list[Chosen] = []
+    sources: list[ChosenSource] = []
     for name in dict.fromkeys(name for name, _ in chosen):
         registered = get(name)
         files = [p for n, p in chosen if n == name]
         if len(files) == 1 or (getattr(registered.importer, "joins", False) and len(paths) > 1):
-            sources.append(Chosen(registered, files))
+            sources.append(ChosenSource(registered, files))
         elif getattr(registered.importer, "beside", False) and len(paths) > 1:
-            sources += [Chosen(registered, [file]) for file in files]
+            sources += [ChosenSource(registered, [file]) for file in files]
         else:
             raise MarchaError(
                 f"{files[0]}: {len(files)} recordings of format {name} "
@@ -237,7 +237,7 @@ def choose(
     return sources
 
 
-def share_options(sources: Sequence[Chosen], values: Mapping[str, Any]) -> list[CommonOptions]:
+def share_options(sources: Sequence[ChosenSource], values: Mapping[str, Any]) -> list[CommonOptions]:
     """Return the options of each source.
 
     ``name=value`` goes to every source whose format has the option, ``start`` and ``epoch`` to the first
@@ -331,9 +331,9 @@ def _tried() -> str:
 
 def _known_otherwise(head: bytes) -> str:
     """Return what a file is that no importer reads, and the remedy; nothing where it is not known either."""
-    for magic, said in _OTHERS.items():
+    for magic, reason in _OTHERS.items():
         if head.startswith(magic):
-            return said
+            return reason
     return ""
 
 

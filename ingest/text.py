@@ -19,7 +19,7 @@ BOM = b"\xef\xbb\xbf"
 
 
 @dataclass(frozen=True)
-class Rows:
+class IntegerRows:
     """The rows of one block of text.
 
     Attributes
@@ -85,7 +85,7 @@ def integer_rows(
     *,
     first_line: int = 1,
     size: int = BLOCK_BYTES,
-) -> Iterator[Rows]:
+) -> Iterator[IntegerRows]:
     """Read lines of ``len(limits)`` integers between commas, semicolons, tabs or spaces.
 
     Lines end in LF, CRLF or CR, also mixed. A wall clock in front (``12:34:56.789``, with or without a date)
@@ -133,18 +133,18 @@ def rows_of(
     report: ReportBuilder,
     *,
     first_line: int = 1,
-) -> tuple[Rows, int]:
+) -> tuple[IntegerRows, int]:
     """Read one piece of text as :func:`integer_rows` does; also return its number of physical lines."""
     from .textscan import CHATTER, scan
 
     low = np.array([a for a, _ in limits], dtype=np.int64)
     high = np.array([b for _, b in limits], dtype=np.int64)
     data = np.frombuffer(piece, dtype=np.uint8)
-    room = 1 + int(np.count_nonzero(data == 10)) + int(np.count_nonzero(data == 13))
-    values = np.empty((len(low), room), dtype=np.int64)
-    lines = np.empty(room, dtype=np.int64)
-    wall = np.empty(room, dtype=np.int32)
-    odd = np.empty((room, 5), dtype=np.int64)
+    capacity = 1 + int(np.count_nonzero(data == 10)) + int(np.count_nonzero(data == 13))
+    values = np.empty((len(low), capacity), dtype=np.int64)
+    lines = np.empty(capacity, dtype=np.int64)
+    wall = np.empty(capacity, dtype=np.int32)
+    odd = np.empty((capacity, 5), dtype=np.int64)
     rows, n_odd, passed = scan(data, low, high, first_line, values, lines, wall, odd)
     for number, start, end, status, column in odd[:n_odd].tolist():
         text = shown(piece[start:end])
@@ -153,7 +153,7 @@ def rows_of(
         else:
             reason = _reason(status, column, names, limits)
             report.drop("bad_row", f"{text}: {reason}; row dropped", line=number)
-    return Rows(values[:, :rows], lines[:rows], wall[:rows]), passed
+    return IntegerRows(values[:, :rows], lines[:rows], wall[:rows]), passed
 
 
 def shown(raw: bytes, width: int = 40) -> str:

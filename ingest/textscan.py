@@ -142,9 +142,9 @@ def scan(data, low, high, first_line, values, lines, wall, odd):
         Range of each column.
     first_line : int
         Number of the first line.
-    values, lines, wall : int64 (columns, room), int64 (room,), int32 (room,)
+    values, lines, wall : int64 (columns, capacity), int64 (capacity,), int32 (capacity,)
         Filled, a row each.
-    odd : int64 array (room, 5)
+    odd : int64 array (capacity, 5)
         Filled for each line that is neither row nor blank: line, start, end, status, column.
 
     Returns

@@ -33,7 +33,7 @@ SCHEMAS = (
 )
 
 
-class Truth(msgspec.Struct, frozen=True):
+class TruthFile(msgspec.Struct, frozen=True):
     """Truth known about a walk.
 
     Attributes
@@ -56,7 +56,7 @@ def is_side_file(path: Path) -> bool:
     return bool(re.search(r"\.truth(\.\w+)?\.(csv|toml)$", path.name))
 
 
-def read_truth(path: Path) -> Truth | None:
+def read_truth(path: Path) -> TruthFile | None:
     """Read the truth beside a raw log; None where there is none.
 
     Raises
@@ -88,7 +88,7 @@ def read_truth(path: Path) -> Truth | None:
         files.append(facts_file)
     if not files:
         return None
-    return Truth(tuple(files), _facts(facts_file) if facts_file in files else {}, tables)
+    return TruthFile(tuple(files), _facts(facts_file) if facts_file in files else {}, tables)
 
 
 def _leg(file: Path) -> Iterator[tuple[ChannelSpec, pl.DataFrame]]:

@@ -21,7 +21,7 @@ from .mcapfile import ZSTD_LEVEL
 from .reader import (
     Attachment,
     Channel,
-    Message,
+    RecordedMessage,
     Recording,
     Window,
 )
@@ -35,8 +35,8 @@ __all__ = [
     "Column",
     "Finding",
     "MarchaError",
-    "Message",
     "OutputExists",
+    "RecordedMessage",
     "Recording",
     "Schema",
     "UsageError",

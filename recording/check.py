@@ -117,21 +117,21 @@ class _Watch:
     def _findings(self, rows: int) -> Iterator[Finding]:
         topic = self.channel.topic
 
-        def said(kind: str, tally: _Tally, text: str) -> Iterator[Finding]:
+        def finding(kind: str, tally: _Tally, text: str) -> Iterator[Finding]:
             if tally.count:
                 yield Finding(kind, tally.count, tally.first, f"{topic}: {text}")
 
-        yield from said(
+        yield from finding(
             "backwards_time", self.backwards, f"time steps back, by up to {self.backwards.worst:.6g} s"
         )
         if self.channel.schema in SAMPLED:
-            yield from said("duplicate_time", self.same, "has the time of the row before")
+            yield from finding("duplicate_time", self.same, "has the time of the row before")
             limit = f"longer than {self.limit_s:.3g} s"
-            yield from said("gap", self.gap, f"pauses {limit}, the longest lasts {self.gap.worst:.6g} s")
+            yield from finding("gap", self.gap, f"pauses {limit}, the longest lasts {self.gap.worst:.6g} s")
         for name, tally in self.missing.items():
             if self.channel.topic.startswith(TOPIC):
                 continue  # an annotation need not state its confidence
-            yield from said("missing_cell", tally, f"{name} has no value")
+            yield from finding("missing_cell", tally, f"{name} has no value")
         for sensor in dict.fromkeys(name[:-2] for name in self.nonzero if name[:-2] in ("acc", "gyr", "mag")):
             axes = [name for name in self.nonzero if name[:-2] == sensor]
             if not any(self.nonzero[name] for name in axes):

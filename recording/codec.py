@@ -20,7 +20,7 @@ from .cdr import (
 )
 from .definitions import Library, load
 from .errors import MarchaError, UsageError
-from .schemas import TECHNOLOGIES, Group, Schema
+from .schemas import TECHNOLOGIES, ColumnGroup, Schema
 
 PREFIX = np.dtype(
     [
@@ -54,7 +54,7 @@ class Binding(NamedTuple):
     path: str
 
 
-class Form(NamedTuple):
+class RecordTemplate(NamedTuple):
     """A record whose texts are known.
 
     Attributes
@@ -74,7 +74,7 @@ class Form(NamedTuple):
 
 
 class Chunk:
-    """A chunk of one channel being laid: records of one size and their index.
+    """A chunk of one channel being filled: records of one size and their index.
 
     Parameters
     ----------
@@ -101,15 +101,15 @@ class Chunk:
         """Log time of each, and where it starts in ``data``."""
         return self._index[: self.rows]
 
-    def lay(self, rows: Rows, first: int, n: int, sequence: int) -> None:
-        """Lay ``n`` rows from the ``first`` on behind what is there."""
-        from .compiled import lay  # numba takes a third of a second to import
+    def append(self, rows: RowAddresses, first: int, n: int, sequence: int) -> None:
+        """Encode ``n`` rows from the ``first`` on behind what is there."""
+        from .compiled import encode_into  # numba takes a third of a second to import
 
         index = self._index[self.rows :]
         index[0, 1] = self.rows * self.size
         fields = rows.fields.copy()
         fields[:, 0] += first * fields[:, 1]
-        lay(
+        encode_into(
             self._data,
             index,
             rows.template,
@@ -123,12 +123,12 @@ class Chunk:
         self.rows += n
 
 
-class Rows:
-    """Rows of a channel as :meth:`Chunk.lay` takes them: where in memory their numbers are.
+class RowAddresses:
+    """Rows of a channel as :meth:`Chunk.append` takes them: where in memory their numbers are.
 
     Parameters
     ----------
-    form : Form
+    form : RecordTemplate
         The record.
     columns : mapping of str to ndarray
         As :meth:`Encoder.arrays` returns them.
@@ -138,7 +138,7 @@ class Rows:
 
     def __init__(
         self,
-        form: Form,
+        form: RecordTemplate,
         columns: Mapping[str, NDArray[Any]],
         t_ns: NDArray[np.int64],
         t_log_ns: NDArray[np.int64],
@@ -164,14 +164,14 @@ def _address(values: NDArray[Any]) -> int:
 
 def resolve_columns(
     schema: Schema, columns: Sequence[str], topic: str
-) -> tuple[tuple[str, ...], list[Group]]:
+) -> tuple[tuple[str, ...], list[ColumnGroup]]:
     """Check the columns of a table against a schema.
 
     Returns
     -------
     names : tuple of str
         Joint (value, marker) names of a named schema, else empty.
-    groups : list of Group
+    groups : list of ColumnGroup
         Groups that are there.
 
     Raises
@@ -183,7 +183,7 @@ def resolve_columns(
     names = _names_of(schema, columns) if schema.names else ()
     if schema.names and not names:
         raise MarchaError(f"{topic}: {schema.name} needs one column a name, got none")
-    groups: list[Group] = []
+    groups: list[ColumnGroup] = []
     known: set[str] = set()
     for group in schema.groups:
         wanted = (
@@ -273,10 +273,10 @@ class Encoder:
             self._constants |= {self._root + k: v for k, v in constants.items()}
         self._text_bindings = [b for b in self.bindings if b.kind == "text"]
         self._free: list[Chunk] = []
-        self._cache: dict[tuple[bytes, ...], Form] = {}
+        self._cache: dict[tuple[bytes, ...], RecordTemplate] = {}
         self.record_size = self._plan(tuple(b"" for _ in self._text_bindings)).template.size
 
-    def _plan(self, texts: tuple[bytes, ...]) -> Form:
+    def _plan(self, texts: tuple[bytes, ...]) -> RecordTemplate:
         """Return the record for given values of the text columns."""
         if texts in self._cache:
             return self._cache[texts]
@@ -296,7 +296,7 @@ class Encoder:
         for path, value in self._constants.items():
             field, at = _field(dtype, path)
             record[at : at + field.itemsize].view(field.base)[:] = value
-        form = self._cache[texts] = Form(
+        form = self._cache[texts] = RecordTemplate(
             dtype, record, _fields(dtype, self._root + self.schema.stamp, self.bindings)
         )
         return form
@@ -328,9 +328,9 @@ class Encoder:
 
     def rows(
         self, columns: Mapping[str, NDArray[Any]], t_ns: NDArray[np.int64], t_log_ns: NDArray[np.int64]
-    ) -> Rows:
-        """Return rows for :meth:`Chunk.lay`; ``columns`` are those that :meth:`arrays` returned."""
-        return Rows(self._plan(()), columns, t_ns, t_log_ns)
+    ) -> RowAddresses:
+        """Return rows for :meth:`Chunk.append`; ``columns`` are those that :meth:`arrays` returned."""
+        return RowAddresses(self._plan(()), columns, t_ns, t_log_ns)
 
     def records(
         self,
@@ -348,9 +348,9 @@ class Encoder:
         for text, numbers in rows_of.items():
             form = self._plan(text)
             part = {b.column: columns[b.column][numbers] for b in self.bindings if b.kind != "text"}
-            rows = Rows(form, part, t_ns[numbers], t_log_ns[numbers])
+            rows = RowAddresses(form, part, t_ns[numbers], t_log_ns[numbers])
             chunk = Chunk(form.template.size, len(numbers))
-            chunk.lay(rows, 0, len(numbers), 0)
+            chunk.append(rows, 0, len(numbers), 0)
             data = chunk.data.reshape(len(numbers), -1)
             data.view(form.dtype)["@sequence"][:, 0] = np.array(numbers) + sequence
             for number, record in zip(numbers, data, strict=True):
@@ -511,7 +511,7 @@ def index_of(log: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int
 
 
 def _fields(dtype: np.dtype[Any], stamp: str, bindings: Sequence[Binding]) -> list[tuple[int, str, int, int]]:
-    """Return :attr:`Form.fields`."""
+    """Return :attr:`RecordTemplate.fields`."""
     fields: Any = dtype.fields
     out = [(TIME, "", 0, fields[f"{stamp}.sec"][1])]
     for binding in bindings:
@@ -584,7 +584,7 @@ class Decoder:
         self.library = library
         self.definition = next(iter(library.values()))
         self.columns = None if columns is None else tuple(columns)
-        self._plan: Plan | None = None
+        self._plan: BoundLayout | None = None
 
     def decode(self, messages: Messages) -> pl.DataFrame:
         """Return ``t_ns``, ``t_log_ns`` and the channel's columns, one row a message, in the order given.
@@ -609,10 +609,10 @@ class Decoder:
         """Return the frame id of a message."""
         return self._make_plan(message).frame_id
 
-    def _make_plan(self, message: memoryview) -> Plan:
-        return Plan(self, layout_of_message(message, self.definition, self.library), message)
+    def _make_plan(self, message: memoryview) -> BoundLayout:
+        return BoundLayout(self, layout_of_message(message, self.definition, self.library), message)
 
-    def _fits(self, plan: Plan, messages: Messages) -> NDArray[Any] | None:
+    def _fits(self, plan: BoundLayout, messages: Messages) -> NDArray[Any] | None:
         """Return a structured view over all messages if each has the plan's layout, else None."""
         size = int(messages.sizes[0])
         if size < plan.layout.dtype.itemsize or (messages.sizes != size).any():
@@ -622,7 +622,7 @@ class Decoder:
 
     def _ordinary(self, messages: Messages) -> pl.DataFrame:
         """Decode messages of different lengths: those of one layout together, rows back in order."""
-        plans: dict[Any, tuple[Plan, list[int]]] = {}
+        plans: dict[Any, tuple[BoundLayout, list[int]]] = {}
         for i in range(len(messages.log)):
             message = messages.message(i)
             plan = self._make_plan(message)
@@ -639,7 +639,7 @@ class Decoder:
         return pl.concat(frames, how="diagonal_relaxed").sort("#", "#k", maintain_order=True).drop("#", "#k")
 
 
-class Plan:
+class BoundLayout:
     """A layout with the columns bound to it."""
 
     def __init__(self, decoder: Decoder, layout: Layout, message: memoryview) -> None:
@@ -691,7 +691,7 @@ class Plan:
 
 
 def _columns(
-    plan: Plan, bindings: Sequence[Binding], block: NDArray[Any], messages: Messages, row: int = 0
+    plan: BoundLayout, bindings: Sequence[Binding], block: NDArray[Any], messages: Messages, row: int = 0
 ) -> Columns:
     """Return the columns of messages of one layout; all are copies, since the chunk's bytes go away."""
     stamp = plan.stamps[row]

@@ -23,7 +23,7 @@ from .codec import (
 
 _SEQUENCE, _LOG, _PUBLISH = (PREFIX.fields[name][1] for name in ("sequence", "log", "publish"))  # type: ignore[index]
 
-#: Records that are laid together, field by field: they stay in the processor's first cache meanwhile.
+#: Records that are encoded together, field by field: they stay in the processor's first cache meanwhile.
 TOGETHER = 64
 
 #: Without counting references to the arrays (_nrt): numba would do that, atomically, at every call.
@@ -78,8 +78,8 @@ _double: Any = _loads(types.float64)
 
 
 @numba.njit(**OPTIONS)
-def lay(data, index, template, sequence, times, fields, ends, size, n):
-    """Lay rows of columns into message records.
+def encode_into(data, index, template, sequence, times, fields, ends, size, n):
+    """Encode rows of columns into message records.
 
     Parameters
     ----------

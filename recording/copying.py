@@ -50,7 +50,7 @@ def copy_into(file: McapFile, rec: Recording, topics: Collection[str] | None, le
             rec.lost(ref, str(e))
             continue
         for old, messages in parts.items():
-            file.submit(_relay, messages, ids[old], level)
+            file.submit(_reencode, messages, ids[old], level)
     file.drain()
 
 
@@ -125,7 +125,7 @@ def _sealed(packed: Packed, level: int | None) -> Packed:
     return packed._replace(chunk=pieces, compression=compression, compressed_size=len(pieces[-1]))
 
 
-def _relay(messages: Messages, channel_id: int, level: int | None) -> Packed:
+def _reencode(messages: Messages, channel_id: int, level: int | None) -> Packed:
     """Lay the messages of one channel into a chunk of its own, under another id."""
     starts = messages.offsets - PREFIX.itemsize
     sizes = messages.sizes + PREFIX.itemsize

@@ -104,7 +104,7 @@ class Window(NamedTuple):
     tables: dict[str, pl.DataFrame]
 
 
-class Message(NamedTuple):
+class RecordedMessage(NamedTuple):
     """One message: topic, the time it speaks of, the time it was known, and column name to value."""
 
     topic: str
@@ -114,7 +114,7 @@ class Message(NamedTuple):
 
 
 @dataclass
-class Source:
+class TopicSource:
     """What is needed to decode one topic."""
 
     topic: str
@@ -340,7 +340,7 @@ class Recording:
 
     def messages(
         self, topics: Collection[str] | None = None, start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[Message]:
+    ) -> Iterator[RecordedMessage]:
         """Yield every message in log-time order, ties by channel order; see :meth:`windows`."""
         order = {t: i for i, t in enumerate(self.sources)}
         for window in self.windows(topics, start_ns, end_ns):
@@ -356,8 +356,8 @@ class Recording:
     def _stream(self, start: int, length: int) -> ReadDataStream:
         return ReadDataStream(BytesIO(self.file.read(start + 9, length - 9)))
 
-    def _make_sources(self) -> dict[str, Source]:
-        out: dict[str, Source] = {}
+    def _make_sources(self) -> dict[str, TopicSource]:
+        out: dict[str, TopicSource] = {}
         for id_, channel in sorted(self.contents.channels.items()):
             record = self.contents.schemas.get(channel.schema_id)
             name = long_name(record.name) if record else ""
@@ -370,7 +370,7 @@ class Recording:
                 add_finding(
                     self.findings, "duplicate_topic", f"{channel.topic}: several channels; read as {topic}"
                 )
-            source = Source(topic, [id_], name, dict(channel.metadata))
+            source = TopicSource(topic, [id_], name, dict(channel.metadata))
             out[topic] = source
             try:
                 source.decoder = self._make_decoder(source, channel, record)
@@ -379,7 +379,7 @@ class Recording:
         return out
 
     def _make_decoder(
-        self, source: Source, channel: records.Channel, record: records.Schema | None
+        self, source: TopicSource, channel: records.Channel, record: records.Schema | None
     ) -> Decoder | EventDecoder:
         if channel.message_encoding != "cdr":
             raise MarchaError(f"message encoding {channel.message_encoding!r}, only cdr is read")
@@ -408,7 +408,7 @@ class Recording:
                 source.declared = None
         return Decoder(known, library, source.declared)
 
-    def _source(self, topic: str) -> Source:
+    def _source(self, topic: str) -> TopicSource:
         source = self.sources.get(topic)
         if source is None:
             topics = ", ".join(self.sources) or "none"
@@ -419,7 +419,7 @@ class Recording:
             )
         return source
 
-    def _select(self, topics: Collection[str] | None) -> list[Source]:
+    def _select(self, topics: Collection[str] | None) -> list[TopicSource]:
         if topics is None:
             return [s for s in self.sources.values() if isinstance(s.decoder, Decoder)]
         wanted = set([topics] if isinstance(topics, str) else topics)
@@ -440,7 +440,7 @@ class Recording:
         ]
 
     def _decode(
-        self, ref: ChunkRef, sources: Sequence[Source], start_ns: int | None, end_ns: int | None
+        self, ref: ChunkRef, sources: Sequence[TopicSource], start_ns: int | None, end_ns: int | None
     ) -> list[tuple[str, Columns]]:
         """Return topic and columns of the rows in one chunk; a broken chunk gives none and a finding."""
         topic_of = {i: s for s in sources for i in s.ids}
@@ -503,7 +503,7 @@ class Recording:
                     window[topic] = table.slice(i, j - i)
             yield Window(start, end, window)
 
-    def _empty(self, source: Source) -> pl.DataFrame:
+    def _empty(self, source: TopicSource) -> pl.DataFrame:
         """Return a table without rows, its columns of the types that rows would have."""
         if isinstance(source.decoder, EventDecoder):
             return source.decoder.decode(_nothing(b""))
@@ -515,7 +515,7 @@ class Recording:
         encoder = Encoder(source.decoder.schema, channel.columns, channel.frame_id, channel.topic, 0)
         return source.decoder.decode(_nothing(encoder.blank())).clear()
 
-    def _describe(self, source: Source, spans: dict[int, tuple[int, int, int]]) -> Channel:
+    def _describe(self, source: TopicSource, spans: dict[int, tuple[int, int, int]]) -> Channel:
         here = [spans[i] for i in source.ids if i in spans]
         count = sum(s[0] for s in here)
         columns, frame_id = source.declared or (), source.metadata.get("frame_id", "")
@@ -533,7 +533,7 @@ class Recording:
             {k: v for k, v in source.metadata.items() if k not in RESERVED},
         )
 
-    def _first(self, source: Source) -> tuple[pl.DataFrame, str] | None:
+    def _first(self, source: TopicSource) -> tuple[pl.DataFrame, str] | None:
         """Return the first readable message of a channel as a row, and its frame id."""
         for ref in self.chunk_refs(set(source.ids)):
             try:
@@ -656,9 +656,9 @@ def _complete(held: dict[str, list[Columns]], horizon: int) -> int:
     return sum(len(log) if log[-1] < horizon else int(np.searchsorted(log, horizon)) for log in logs)
 
 
-def _rows(topic: str, order: int, table: pl.DataFrame) -> Iterator[tuple[int, int, int, Message]]:
+def _rows(topic: str, order: int, table: pl.DataFrame) -> Iterator[tuple[int, int, int, RecordedMessage]]:
     names = [c for c in table.columns if c not in _NOW]
     values = table.select(names).rows() if names else [()] * table.height
     times = zip(table["t_ns"].to_list(), table["t_log_ns"].to_list(), values, strict=True)
     for i, (t_ns, log, row) in enumerate(times):
-        yield log, order, i, Message(topic, t_ns, log, dict(zip(names, row, strict=True)))
+        yield log, order, i, RecordedMessage(topic, t_ns, log, dict(zip(names, row, strict=True)))

@@ -36,7 +36,7 @@ class Column(msgspec.Struct, frozen=True):
     kind: str = "number"
 
 
-class Group(msgspec.Struct, frozen=True):
+class ColumnGroup(msgspec.Struct, frozen=True):
     """Columns that are there together or not at all.
 
     Attributes
@@ -69,7 +69,7 @@ class Schema(msgspec.Struct, frozen=True):
         ``package/msg/Name``.
     title : str
         What the message is for.
-    groups : tuple of Group
+    groups : tuple of ColumnGroup
         Columns; ``t_ns`` comes before them in every table.
     names : str
         In a named schema the field with the names (constant in a channel): every column exists once a name.
@@ -81,7 +81,7 @@ class Schema(msgspec.Struct, frozen=True):
 
     name: str
     title: str
-    groups: tuple[Group, ...]
+    groups: tuple[ColumnGroup, ...]
     names: str = ""
     explode: str = ""
     stamp: str = "header.stamp"
@@ -121,16 +121,16 @@ def _nan(*columns: Column) -> dict[str, float]:
     return {c.field: _NAN for c in columns}
 
 
-def _imu_group(columns: tuple[Column, ...], covariance: str) -> Group:
+def _imu_group(columns: tuple[Column, ...], covariance: str) -> ColumnGroup:
     absent = {**_nan(*columns), f"{covariance}[0]": -1.0}
-    return Group(columns, optional=True, absent=absent, mark=(f"{covariance}[0]", -1.0))
+    return ColumnGroup(columns, optional=True, absent=absent, mark=(f"{covariance}[0]", -1.0))
 
 
-def _pose(position: str, rotation: str, doc: str) -> tuple[Group, Group]:
+def _pose(position: str, rotation: str, doc: str) -> tuple[ColumnGroup, ColumnGroup]:
     identity = {f"{rotation}.{a}": v for a, v in _IDENTITY.items()}
     return (
-        Group(_xyz("pos", "m", position, f"position {doc}")),
-        Group(_quat(rotation, f"rotation {doc}"), optional=True, absent=identity),
+        ColumnGroup(_xyz("pos", "m", position, f"position {doc}")),
+        ColumnGroup(_quat(rotation, f"rotation {doc}"), optional=True, absent=identity),
     )
 
 
@@ -163,19 +163,19 @@ _ALL = (
     Schema(
         "sensor_msgs/msg/MagneticField",
         "magnetometer",
-        (Group(_xyz("mag", "T", "magnetic_field", "magnetic field in the sensor frame")),),
+        (ColumnGroup(_xyz("mag", "T", "magnetic_field", "magnetic field in the sensor frame")),),
     ),
     Schema(
         "sensor_msgs/msg/NavSatFix",
         "GNSS fix",
         (
-            Group(
+            ColumnGroup(
                 (
                     Column("lat_deg", "°", "latitude", "geodetic latitude, WGS 84, north positive"),
                     Column("lon_deg", "°", "longitude", "longitude, WGS 84, east positive"),
                 )
             ),
-            Group(
+            ColumnGroup(
                 (
                     Column(
                         "alt_m",
@@ -187,13 +187,13 @@ _ALL = (
                 optional=True,
                 absent={"altitude": _NAN},
             ),
-            Group(
+            ColumnGroup(
                 _SD,
                 optional=True,
                 present={"position_covariance_type": 2},
                 mark=("position_covariance_type", 0),
             ),
-            Group(
+            ColumnGroup(
                 (
                     Column("status", "-", "status.status", "NavSatStatus: -1 no fix, 0 fix, 1 SBAS, 2 GBAS"),
                     Column(
@@ -210,20 +210,20 @@ _ALL = (
     Schema(
         "sensor_msgs/msg/FluidPressure",
         "barometer",
-        (Group((Column("pressure_pa", "Pa", "fluid_pressure", "absolute pressure"),)),),
+        (ColumnGroup((Column("pressure_pa", "Pa", "fluid_pressure", "absolute pressure"),)),),
     ),
     Schema(
         "sensor_msgs/msg/Temperature",
         "temperature",
-        (Group((Column("temperature_c", "°C", "temperature", "temperature"),)),),
+        (ColumnGroup((Column("temperature_c", "°C", "temperature", "temperature"),)),),
     ),
     Schema(
         "sensor_msgs/msg/JointState",
         "joint angles: encoder, reference or estimate",
         (
-            Group((Column("", "rad", "position[i]", "angle (or m of a prismatic joint)"),)),
-            Group((Column(".vel", "rad/s", "velocity[i]", "angular rate"),), optional=True),
-            Group((Column(".effort", "N m", "effort[i]", "torque"),), optional=True),
+            ColumnGroup((Column("", "rad", "position[i]", "angle (or m of a prismatic joint)"),)),
+            ColumnGroup((Column(".vel", "rad/s", "velocity[i]", "angular rate"),), optional=True),
+            ColumnGroup((Column(".effort", "N m", "effort[i]", "torque"),), optional=True),
         ),
         names="name",
     ),
@@ -235,24 +235,24 @@ _ALL = (
     Schema(
         "geometry_msgs/msg/PointStamped",
         "position",
-        (Group(_xyz("pos", "m", "point", f"position {_IN_NAV}")),),
+        (ColumnGroup(_xyz("pos", "m", "point", f"position {_IN_NAV}")),),
     ),
     Schema(
         "geometry_msgs/msg/QuaternionStamped",
         "orientation",
-        (Group(_quat("quaternion", "rotation from the body frame to the navigation frame (rot_nb)")),),
+        (ColumnGroup(_quat("quaternion", "rotation from the body frame to the navigation frame (rot_nb)")),),
     ),
     Schema(
         "geometry_msgs/msg/Vector3Stamped",
         "velocity",
-        (Group(_xyz("vel", "m/s", "vector", "velocity in the navigation frame")),),
+        (ColumnGroup(_xyz("vel", "m/s", "vector", "velocity in the navigation frame")),),
     ),
     Schema(
         "geometry_msgs/msg/TwistStamped",
         "velocity and angular rate",
         (
-            Group(_xyz("vel", "m/s", "twist.linear", "velocity in frame_id")),
-            Group(_xyz("gyr", "rad/s", "twist.angular", "angular rate in frame_id")),
+            ColumnGroup(_xyz("vel", "m/s", "twist.linear", "velocity in frame_id")),
+            ColumnGroup(_xyz("gyr", "rad/s", "twist.angular", "angular rate in frame_id")),
         ),
     ),
     Schema(
@@ -260,7 +260,7 @@ _ALL = (
         "transform from the child frame to frame_id",
         (
             *_pose("transform.translation", "transform.rotation", "of the child frame in frame_id"),
-            Group((Column("child_frame_id", "-", "child_frame_id", "the child frame", "text"),)),
+            ColumnGroup((Column("child_frame_id", "-", "child_frame_id", "the child frame", "text"),)),
         ),
     ),
     Schema(
@@ -268,7 +268,7 @@ _ALL = (
         "frames, static; one row a transform",
         (
             *_pose("transform.translation", "transform.rotation", "of the child frame in its parent"),
-            Group(
+            ColumnGroup(
                 (
                     Column("parent_frame_id", "-", "header.frame_id", "the parent frame", "text"),
                     Column("child_frame_id", "-", "child_frame_id", "the child frame", "text"),
@@ -281,13 +281,13 @@ _ALL = (
     Schema(
         "marcha_msgs/msg/Stance",
         "whether the foot is still",
-        (Group((Column("still", "-", "still", "true while still", "flag"),)),),
+        (ColumnGroup((Column("still", "-", "still", "true while still", "flag"),)),),
     ),
     Schema(
         "marcha_msgs/msg/Step",
         "one step or stride",
         (
-            Group(
+            ColumnGroup(
                 (
                     Column("start_ns", "ns", "start", "start of the swing", "time"),
                     Column("end_ns", "ns", "end", "end of the swing", "time"),
@@ -303,21 +303,21 @@ _ALL = (
         "marcha_msgs/msg/NavigationSigma",
         "the standard deviations that an estimator states of its own position, velocity and attitude",
         tuple(
-            Group(columns, optional=True, absent=_nan(*columns))
+            ColumnGroup(columns, optional=True, absent=_nan(*columns))
             for columns in (_xyz(f"sigma_{key}", *rest) for key, *rest in _NAVIGATION_SIGMAS)
         ),
     ),
     Schema(
         "marcha_msgs/msg/NamedValues",
         "numbers with names: detector statistics, standard deviations, filter internals",
-        (Group((Column("", "as named", "values[i]", "the value"),)),),
+        (ColumnGroup((Column("", "as named", "values[i]", "the value"),)),),
         names="names",
     ),
     Schema(
         "marcha_msgs/msg/OpticalMarkers",
         "markers of an optical system",
         tuple(
-            Group(
+            ColumnGroup(
                 (Column(f".{a}", "m", f"positions[i].{a}", f"position in frame_id, {a}; NaN where not seen"),)
             )
             for a in "xyz"
@@ -328,9 +328,9 @@ _ALL = (
         "marcha_msgs/msg/RadioSignal",
         "Wi-Fi or BLE signal strength",
         (
-            Group((_MAC, Column("rssi_dbm", "dBm", "rssi", "received signal strength"))),
-            Group((_TECHNOLOGY,), optional=True),
-            Group(
+            ColumnGroup((_MAC, Column("rssi_dbm", "dBm", "rssi", "received signal strength"))),
+            ColumnGroup((_TECHNOLOGY,), optional=True),
+            ColumnGroup(
                 (
                     Column(
                         "tx_power_dbm", "dBm", "tx_power", "power that the transmitter states (BLE: at 1 m)"
@@ -339,12 +339,12 @@ _ALL = (
                 optional=True,
                 absent={"tx_power": _NAN},
             ),
-            Group(
+            ColumnGroup(
                 (Column("frequency_hz", "Hz", "frequency", "carrier frequency"),),
                 optional=True,
                 absent={"frequency": _NAN},
             ),
-            Group(
+            ColumnGroup(
                 (
                     Column(
                         "last_seen_ns", "ns", "last_seen", "last heard, by the receiver's own clock", "time"
@@ -358,9 +358,9 @@ _ALL = (
         "marcha_msgs/msg/Ranging",
         "measured distance to an anchor",
         (
-            Group((_MAC, Column("distance_m", "m", "distance", "measured distance"))),
-            Group((_TECHNOLOGY,), optional=True),
-            Group(
+            ColumnGroup((_MAC, Column("distance_m", "m", "distance", "measured distance"))),
+            ColumnGroup((_TECHNOLOGY,), optional=True),
+            ColumnGroup(
                 (Column("sd_m", "m", "sigma", "its standard deviation"),),
                 optional=True,
                 absent={"sigma": _NAN},

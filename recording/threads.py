@@ -32,11 +32,11 @@ def helpers(name: str, most: int = 4) -> Executor:
         Most threads that this work can use; 0 where it is too little for any.
     """
     if most == 0 or threads() == 1:
-        return _Here()
+        return _InlineExecutor()
     return ThreadPoolExecutor(min(most, threads()), thread_name_prefix=f"marcha-{name}")
 
 
-class _Here(Executor):
+class _InlineExecutor(Executor):
     """Does everything at once, in the caller's thread."""
 
     def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
@@ -48,7 +48,7 @@ class _Here(Executor):
         return future
 
 
-class Ahead(Iterator[T]):
+class Prefetch(Iterator[T]):
     """Items that a thread makes before they are asked for; from now on, not from the first on.
 
     Parameters

@@ -395,7 +395,7 @@ class Writer:
     def _put(
         self, out: _Output, encoder: Encoder, arrays: dict[str, NDArray[Any]], t_ns: Times, log: Times
     ) -> None:
-        """Lay rows into chunks; keep a chunk that is not full for the next call."""
+        """Encode rows into chunks; keep a chunk that is not full for the next call."""
         if not encoder.even:
             records = encoder.records(arrays, t_ns, log, out.sequence)
             out.sequence += len(records)
@@ -405,7 +405,7 @@ class Writer:
         while at < len(log):
             chunk = out.chunk = out.chunk or encoder.chunk(CHUNK_SIZE)
             n = min(len(log) - at, chunk.most - chunk.rows)
-            chunk.lay(rows, at, n, out.sequence)
+            chunk.append(rows, at, n, out.sequence)
             at += n
             out.sequence += n
             if chunk.rows == chunk.most:

@@ -2,7 +2,7 @@
 
 from .alignment import ALIGNMENTS, align
 from .api import replay
-from .attachment import NOT_RAW, Attachment
+from .attachment import NOT_RAW, ChannelAttachment
 from .calibrations import calibrate, load_calibration, save_calibration
 from .clock import Clock, ManualClock, SystemClock
 from .engine import Engine, ReplayResult, Run
@@ -35,8 +35,8 @@ from .tuning import Tuned, tune
 __all__ = [
     "ALIGNMENTS",
     "NOT_RAW",
-    "Attachment",
     "Batch",
+    "ChannelAttachment",
     "Clock",
     "Engine",
     "EstimatorSpec",

@@ -31,7 +31,7 @@ NOT_RAW = ("/reference/", "/estimate/", "/annotation/")
 
 
 @dataclass(frozen=True)
-class Chosen:
+class NamedChannels:
     """Channels that the user named.
 
     Attributes
@@ -46,7 +46,7 @@ class Chosen:
     roles: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     @classmethod
-    def parse(cls, texts: Iterable[str]) -> Chosen:
+    def parse(cls, texts: Iterable[str]) -> NamedChannels:
         """Read ``topic`` and ``role=topic``."""
         topics: list[str] = []
         roles: dict[str, tuple[str, ...]] = {}
@@ -73,7 +73,7 @@ class Chosen:
 
 
 @dataclass(frozen=True)
-class Attachment:
+class ChannelAttachment:
     """Channels of one run, by input, and what to say about the choice."""
 
     channels: dict[str, tuple[PlannedChannel, ...]]
@@ -122,10 +122,10 @@ def attach(
     inputs: Sequence[Input],
     name: str,
     source: Source,
-    chosen: Chosen,
+    chosen: NamedChannels,
     served: Mapping[str, PlannedChannel],
     device: str = "",
-) -> list[Attachment]:
+) -> list[ChannelAttachment]:
     """Return the attachments of an estimator, one a run.
 
     Parameters
@@ -136,7 +136,7 @@ def attach(
         Its name, for messages.
     source : Source
         Whose channels there are.
-    chosen : Chosen
+    chosen : NamedChannels
         Channels that the user named.
     served : mapping of str to PlannedChannel
         Inputs that earlier stages serve.
@@ -173,7 +173,7 @@ def attach(
     return [_complete(inputs, name, source, chosen, fixed | group, device, notes) for group in groups]
 
 
-def _primary(inputs: Sequence[Input], served: Mapping[str, object], chosen: Chosen) -> Input | None:
+def _primary(inputs: Sequence[Input], served: Mapping[str, object], chosen: NamedChannels) -> Input | None:
     """Return the input that decides about the device: the first required one that nothing else serves."""
     free = [i for i in inputs if i.name not in served and i.name not in chosen.roles]
     return next((i for i in free if not i.optional), None)
@@ -184,7 +184,7 @@ def _same_request(a: Input, b: Input) -> bool:
 
 
 def _candidates(
-    need: Input, source: Source, chosen: Chosen, device: str = "", *, only_named: bool = False
+    need: Input, source: Source, chosen: NamedChannels, device: str = "", *, only_named: bool = False
 ) -> list[PlannedChannel]:
     """Return the raw channels that an input could take; of those, the ones nearest to the device if one is given.
 
@@ -208,7 +208,7 @@ def _nearest(channels: list[PlannedChannel], device: str) -> list[PlannedChannel
     return []
 
 
-def _named(need: Input, name: str, source: Source, chosen: Chosen) -> tuple[PlannedChannel, ...]:
+def _named(need: Input, name: str, source: Source, chosen: NamedChannels) -> tuple[PlannedChannel, ...]:
     channels = tuple(source.channels[t] for t in chosen.roles[need.name])
     for channel in channels:
         if channel.schema != need.schema:
@@ -232,7 +232,7 @@ def _lacks(channel: PlannedChannel, column: str, name: str, source: Source) -> s
     )
 
 
-def _nothing_fits(need: Input, name: str, source: Source, chosen: Chosen) -> str:
+def _nothing_fits(need: Input, name: str, source: Source, chosen: NamedChannels) -> str:
     pool = [source.channels[t] for t in chosen.topics] or [
         c for t, c in source.channels.items() if not t.startswith(NOT_RAW)
     ]
@@ -252,7 +252,7 @@ def _together(
     candidates: Sequence[PlannedChannel],
     name: str,
     source: Source,
-    chosen: Chosen,
+    chosen: NamedChannels,
     notes: list[Finding],
 ) -> dict[str, tuple[PlannedChannel, ...]]:
     """Give each of several inputs that ask for the same a channel of its own."""
@@ -294,11 +294,11 @@ def _complete(
     inputs: Sequence[Input],
     name: str,
     source: Source,
-    chosen: Chosen,
+    chosen: NamedChannels,
     have: Mapping[str, tuple[PlannedChannel, ...]],
     device: str,
     notes: Sequence[Finding],
-) -> Attachment:
+) -> ChannelAttachment:
     """Attach the further inputs of one run."""
     found = list(notes)
     channels: dict[str, tuple[PlannedChannel, ...]] = {}
@@ -337,4 +337,4 @@ def _complete(
             raise UsageError(
                 _nothing_fits(need, name, source, chosen) + f"; name it with --input {need.name}=TOPIC"
             )
-    return Attachment({i.name: channels[i.name] for i in inputs}, tuple(found))
+    return ChannelAttachment({i.name: channels[i.name] for i in inputs}, tuple(found))

@@ -16,7 +16,7 @@ from ..algorithms.contract import ALL_COLUMNS, AlgorithmError, ChannelInfo, Floa
 from ..recording.atomic import AtomicFile
 from ..recording.errors import Finding, MarchaError, UsageError
 from ..recording.provenance import environment, hash_file
-from .attachment import Chosen, attach
+from .attachment import NamedChannels, attach
 from .sources import RecordingSource
 
 if TYPE_CHECKING:
@@ -138,7 +138,7 @@ def calibrate(
         raise UsageError(str(error)) from None
     if not recordings:
         raise UsageError(f"calibration {name}: no recording given")
-    chosen = Chosen.parse(inputs or ())
+    chosen = NamedChannels.parse(inputs or ())
     sources = [RecordingSource(r) for r in recordings]
     chosen.check(sources[0], (i.name for i in calibrator.inputs))
     spans = [(s, span, label) for s in sources for span, label in _spans(s, interval, start_ns, end_ns)]

@@ -15,12 +15,12 @@ import polars as pl
 
 from ..recording.errors import Finding, UsageError
 from ..recording.provenance import environment
-from ..recording.threads import Ahead
+from ..recording.threads import Prefetch
 from .blocks import Block, joined_by_name
 from .calibrations import corrections
 from .clock import Clock, SystemClock
 from .gaps import GapPolicy, Gaps, policy_of
-from .merging import LEVELS, Merged, Part
+from .merging import LEVELS, Merged, MergedPart
 from .messages import MessageFeed
 from .plan import Plan, PlannedRun
 from .rows import RowFeed
@@ -306,7 +306,7 @@ class Engine:
         """
         self._stop_reading()
         end_ns = max(self._newest_ns, self.source.end_ns if self._end_ns is None else self._newest_ns)
-        self._drive(Part({}, {}), end_ns)
+        self._drive(MergedPart({}, {}), end_ns)
         output = next((s.path for s in self.sinks if isinstance(s, RecordingSink)), None)
         result = ReplayResult(output, [self._result(r) for r in self.runners])
         if complete is not None:
@@ -386,7 +386,7 @@ class Engine:
 
     def _reading(self) -> Iterator[Batch]:
         batches = self.source.batches(self._topics, self._position_start(), self._end_ns)
-        return Ahead(batches, "replay", 2) if self.source.seekable else batches  # live: has its own queue
+        return Prefetch(batches, "replay", 2) if self.source.seekable else batches  # live: has its own queue
 
     def _position_start(self) -> int | None:
         return self._position_ns if self._position_ns != self._begin_ns else self._start_ns
@@ -413,7 +413,7 @@ class Engine:
             begin, end = self._begin_ns, self._end_ns if self._end_ns is not None else self.source.end_ns
             self._progress(min(newest, end) - begin if end > begin else newest, max(0, end - begin))
 
-    def _drive(self, part: Part, end_ns: int | None = None) -> None:
+    def _drive(self, part: MergedPart, end_ns: int | None = None) -> None:
         """Take the messages of a part through all runs, each behind those whose outputs it reads.
 
         ``end_ns``: these are the last ones; estimators give what they hold.

@@ -50,7 +50,7 @@ class Merged:
     def __len__(self) -> int:
         return self.log_ns.size
 
-    def part(self, first: int, last: int) -> Part:
+    def part(self, first: int, last: int) -> MergedPart:
         """Return the messages at places [first, last)."""
         tables, keys = {}, {}
         for topic, places in self.positions.items():
@@ -61,11 +61,11 @@ class Merged:
                     self.batch.tables[topic] if whole else self.batch.tables[topic][int(lo) : int(hi)]
                 )
                 keys[topic] = places[lo:hi] * LEVELS
-        return Part(tables, keys)
+        return MergedPart(tables, keys)
 
 
 @dataclass
-class Part:
+class MergedPart:
     """Consecutive messages of the source and, as they come, the results of runs that others read.
 
     Attributes

@@ -12,7 +12,7 @@ import polars as pl
 from ..algorithms.contract import IntArray, Message
 from ..recording.errors import Finding
 from .gaps import ChannelGuard, Gaps, policy_of
-from .merging import Part
+from .merging import MergedPart
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class MessageFeed:
         """Number of restarts so far."""
         return sum(g.restarts for g in self.guards if g is not None)
 
-    def take(self, part: Part) -> MessageBlock:
+    def take(self, part: MergedPart) -> MessageBlock:
         """Return the messages of this part that the estimator is given, in their order."""
         tables: list[pl.DataFrame] = []
         keys: list[IntArray] = []

@@ -34,7 +34,7 @@ Loader = Callable[[str, "Sequence[str] | None"], "pl.DataFrame | None"]
 
 
 @dataclass(frozen=True)
-class Track:
+class Trajectory:
     """Positions over time, with orientation where it is known.
 
     Attributes
@@ -60,7 +60,7 @@ class Track:
         return None if self.quat_wxyz is None else yaw_of(self.quat_wxyz)
 
 
-def track_of(table: pl.DataFrame | None) -> Track | None:
+def track_of(table: pl.DataFrame | None) -> Trajectory | None:
     """Return the usable rows of a pose table, in time order, or None where there are none."""
     if table is None or not set(POSITION) <= set(table.columns):
         return None
@@ -74,7 +74,7 @@ def track_of(table: pl.DataFrame | None) -> Track | None:
     quat = table.select(QUATERNION).to_numpy() if set(QUATERNION) <= set(table.columns) else None
     if quat is not None and not np.isfinite(quat).all():
         quat = None
-    return Track(table["t_ns"].to_numpy(), table.select(POSITION).to_numpy(order="c"), quat)
+    return Trajectory(table["t_ns"].to_numpy(), table.select(POSITION).to_numpy(order="c"), quat)
 
 
 @dataclass(frozen=True)
@@ -249,14 +249,14 @@ class RunView:
         return replace(self, start_ns=start_ns, end_ns=end_ns, truth=Truth())
 
     @cached_property
-    def track(self) -> Track | None:
+    def track(self) -> Trajectory | None:
         """The estimated track: of the output ``pose``, else of ``position``."""
         headings = QUATERNION if self.reference is not None else ()
         track = track_of(self.table("pose", (*POSITION, *headings)))
         return track if track is not None else track_of(self.table("position", POSITION))
 
     @cached_property
-    def reference_track(self) -> Track | None:
+    def reference_track(self) -> Trajectory | None:
         """The reference track."""
         return track_of(self._within(self.reference))
 

@@ -26,7 +26,7 @@ from ..algorithms.contract import (
     RowEstimator,
 )
 from ..recording.errors import Finding, UsageError
-from .attachment import Attachment, Chosen, attach, device_of, serving
+from .attachment import ChannelAttachment, NamedChannels, attach, device_of, serving
 from .calibrations import calibrations_of, usable
 from .messages import AttachedChannel
 from .sources import PlannedChannel, Source
@@ -243,7 +243,7 @@ def plan_runs(
     params = dict(params or {})
     chains = [[_Maker(e, params) for e in _chain(asked)] for asked in estimators]
     makers = [m for c in chains for m in c]
-    chosen = Chosen.parse(inputs or ())
+    chosen = NamedChannels.parse(inputs or ())
     planner = _Planner(source, params, chosen, taken, calibrations)
     stages = [s for m in makers for s in planner.default_stages(m)]
     unused = [p for p in params if not any(p in m.shared for m in (*makers, *stages))]
@@ -267,7 +267,7 @@ class _Planner:
         self,
         source: Source,
         params: Mapping[str, Any],
-        chosen: Chosen,
+        chosen: NamedChannels,
         taken: Sequence[str],
         calibrations: Sequence[Calibration],
     ) -> None:
@@ -314,7 +314,7 @@ class _Planner:
                 [i for i in inputs if i not in staged], maker.name, self.source, self.chosen, served, device
             )
             if len(staged) < len(inputs)
-            else [Attachment({})]
+            else [ChannelAttachment({})]
         )
         planned: list[PlannedRun] = []
         for attachment in attachments:
@@ -336,10 +336,10 @@ class _Planner:
                 behind = [b | {need.name: (c,)} for b in behind for c in fitting]
             for served_by in behind:
                 whole = {i.name: (channels | served_by).get(i.name, ()) for i in inputs}
-                planned.append(self._plan(maker, Attachment(whole, tuple(notes)), own))
+                planned.append(self._plan(maker, ChannelAttachment(whole, tuple(notes)), own))
         return planned
 
-    def _plan(self, maker: _Maker, attachment: Attachment, own: bool) -> PlannedRun:
+    def _plan(self, maker: _Maker, attachment: ChannelAttachment, own: bool) -> PlannedRun:
         primary, notes = attachment.primary, list(attachment.findings)
         rate = 0.0 if primary.run else self.source.rate_hz(primary.topic)
         estimator, values = maker.build(rate)
@@ -399,7 +399,7 @@ class _Planner:
     def _context(
         self,
         attached: Sequence[AttachedChannel],
-        attachment: Attachment,
+        attachment: ChannelAttachment,
         calibrations: Mapping[str, Calibration],
     ) -> Context:
         infos: dict[str, list[ChannelInfo]] = {name: [] for name in attachment.channels}
@@ -479,7 +479,9 @@ class _Maker:
         return estimator, msgspec.to_builtins(params) if isinstance(params, msgspec.Struct) else {}
 
 
-def _outputs(run: str, estimator: Any, attachment: Attachment, maker: _Maker) -> dict[str, PlannedChannel]:
+def _outputs(
+    run: str, estimator: Any, attachment: ChannelAttachment, maker: _Maker
+) -> dict[str, PlannedChannel]:
     about = {
         "run": run,
         "estimator": maker.name,

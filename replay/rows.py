@@ -12,7 +12,7 @@ from ..algorithms.contract import FloatArray, IntArray
 from ..recording.errors import Finding
 from .blocks import by_columns
 from .gaps import ChannelGuard, GapPolicy
-from .merging import Part
+from .merging import MergedPart
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class RowFeed:
         """Number of restarts so far."""
         return self.guard.restarts
 
-    def take(self, part: Part) -> RowBlock:
+    def take(self, part: MergedPart) -> RowBlock:
         """Return the rows that these messages complete."""
         topic, columns = self.inputs[0]
         assert topic is not None
@@ -115,7 +115,13 @@ class RowFeed:
         return RowBlock(values, times, logs, keys, resets)
 
     def _join(
-        self, index: int, part: Part, topic: str, names: tuple[str, ...], keys: IntArray, into: FloatArray
+        self,
+        index: int,
+        part: MergedPart,
+        topic: str,
+        names: tuple[str, ...],
+        keys: IntArray,
+        into: FloatArray,
     ) -> None:
         """Put the newest message before each row into it; what no row has taken yet waits."""
         state, n = self._state, len(keys)

@@ -348,9 +348,9 @@ class MessageRunner(Runner):
         rows: list[FloatArray] = []
         for a in range(first, last, step):
             b = min(a + step, last)
-            room = (b - a) * estimator.max_results
-            message, t_ns = np.empty(room, np.int64), np.empty(room, np.int64)
-            out = np.empty((room, estimator.width))
+            capacity = (b - a) * estimator.max_results
+            message, t_ns = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
+            out = np.empty((capacity, estimator.width))
             begin = time.perf_counter()
             n = int(
                 estimator.run(

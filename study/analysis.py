@@ -15,8 +15,8 @@ import polars as pl
 from ..replay.metrics import nees_bounds
 from . import config as cfg
 from .statistics import (
-    Comparison,
-    Group,
+    GroupComparison,
+    GroupSummary,
     compare,
     corrected,
     outlier_mask,
@@ -82,7 +82,7 @@ def groups(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     """Summarize every metric by filter, configuration and detector, for all, unclipped and clipped inputs.
 
     Columns: ``metric, unit, subset``, the factors (empty where pooled) and the fields of
-    :class:`~marcha.study.statistics.Group`.
+    :class:`~marcha.study.statistics.GroupSummary`.
     """
     rows: list[dict[str, Any]] = []
     pooled = [FACTORS, ("filter", "detector"), ("configuration", "detector")]
@@ -104,7 +104,9 @@ def groups(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
                         **msgspec.structs.asdict(summary),
                     }
                 )
-    fields = {f.name: pl.String if f.name == "note" else pl.Float64 for f in msgspec.structs.fields(Group)}
+    fields = {
+        f.name: pl.String if f.name == "note" else pl.Float64 for f in msgspec.structs.fields(GroupSummary)
+    }
     fields |= dict.fromkeys(("n", "outliers", "missing"), pl.Int64)
     schema = {**dict.fromkeys(("metric", "unit", "subset", *FACTORS), pl.String), **fields}
     return pl.DataFrame(rows, schema=schema)
@@ -125,7 +127,7 @@ def comparisons(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     configuration.
 
     Columns: ``metric, unit, factor`` (what is compared), ``within`` (what is held fixed), ``a, b`` and the
-    fields of :class:`~marcha.study.statistics.Comparison`.
+    fields of :class:`~marcha.study.statistics.GroupComparison`.
     """
     frame = frame.filter(~pl.col("outlier") & pl.col("value").is_finite())
     levels = order(frame, config)
@@ -164,7 +166,7 @@ def comparisons(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
                     }
                 )
     kinds = {
-        f.name: pl.String if f.name == "note" else pl.Float64 for f in msgspec.structs.fields(Comparison)
+        f.name: pl.String if f.name == "note" else pl.Float64 for f in msgspec.structs.fields(GroupComparison)
     }
     kinds |= dict.fromkeys(("n_a", "n_b"), pl.Int64)
     schema = {**dict.fromkeys(("metric", "unit", "factor", "within", "a", "b"), pl.String), **kinds}

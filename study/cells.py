@@ -27,13 +27,13 @@ from ..replay.attachment import NOT_RAW
 from ..replay.engine import Run
 from ..replay.plan import EstimatorSpec
 from ..replay.runs import warm_up
-from .plan import Job, Source, Task
+from .plan import Job, StudyRecording, StudyTask
 
 #: Points that are kept of a track: enough for a figure, small enough for hundreds of walks.
 TRACK_POINTS = 400
 
 
-class Cell(msgspec.Struct, frozen=True):
+class StudyCell(msgspec.Struct, frozen=True):
     """What one method made of one input of one recording.
 
     Attributes
@@ -89,14 +89,14 @@ class Cell(msgspec.Struct, frozen=True):
         return np.frombuffer(self.track, np.float32).reshape(-1, 3)
 
 
-def cached(source: Source, folder: Path) -> Path:
+def cached(source: StudyRecording, folder: Path) -> Path:
     """Return where the recording of ``source`` is, or will be once it is converted."""
     if source.kind == "mcap" and not source.options:
         return Path(source.path)
     return folder / f"{source.name.replace('/', '__')}-{source.digest[:8]}.mcap"
 
 
-def run_task(task: Task) -> list[Cell]:
+def run_task(task: StudyTask) -> list[StudyCell]:
     """Do one task: prepare the recording and, unless there are no jobs, replay and evaluate it."""
     path = prepare(task.source, Path(task.folder))
     if not task.jobs:
@@ -109,7 +109,7 @@ def run_task(task: Task) -> list[Cell]:
         if len(task.jobs) == 1:
             return failed(task, error)
     # One of the methods cannot run on this recording: find out which, and keep the others.
-    cells: list[Cell] = []
+    cells: list[StudyCell] = []
     for job in task.jobs:
         try:
             cells += _run(rec, task.source, [job], topics)
@@ -118,7 +118,7 @@ def run_task(task: Task) -> list[Cell]:
     return cells
 
 
-def failed(task: Task, error: Exception) -> list[Cell]:
+def failed(task: StudyTask, error: Exception) -> list[StudyCell]:
     """Return the cells of a task that ended in an error."""
     text = " ".join(str(error).split()) or type(error).__name__
     expected = isinstance(error, MarchaError | ValueError | OSError)
@@ -126,9 +126,9 @@ def failed(task: Task, error: Exception) -> list[Cell]:
     return [_cell(job, task.source, status="failed", error=reason) for job in task.jobs]
 
 
-def _cell(job: Job, source: Source, **values: Any) -> Cell:
+def _cell(job: Job, source: StudyRecording, **values: Any) -> StudyCell:
     method = job.method
-    return Cell(
+    return StudyCell(
         key=job.key,
         recording=source.name,
         input=values.pop("input", ""),
@@ -141,7 +141,7 @@ def _cell(job: Job, source: Source, **values: Any) -> Cell:
     )
 
 
-def prepare(source: Source, folder: Path) -> Path:
+def prepare(source: StudyRecording, folder: Path) -> Path:
     """Return the recording of ``source``: converted, simulated, or the file itself."""
     path = cached(source, folder)
     if path.exists():
@@ -159,7 +159,7 @@ def prepare(source: Source, folder: Path) -> Path:
     return path
 
 
-def _with_truth(source: Source, path: Path) -> None:
+def _with_truth(source: StudyRecording, path: Path) -> None:
     """Copy a recording and add what the study knows about its walk."""
     rec = open_recording(source.path)
     truth = {k: str(v).lower() if isinstance(v, bool) else str(v) for k, v in source.options.items()}
@@ -168,7 +168,7 @@ def _with_truth(source: Source, path: Path) -> None:
         out.add_metadata("truth", {**truth, **rec.metadata.get("truth", {})})
 
 
-def _simulate(source: Source, path: Path) -> None:
+def _simulate(source: StudyRecording, path: Path) -> None:
     from ..ingest import convert
     from ..ingest.simulate import simulate
 
@@ -200,7 +200,9 @@ def warm(name: str) -> None:
     warm_up(estimator, blocks=not getattr(estimator, "offline", False))
 
 
-def _run(rec: Recording, source: Source, jobs: Sequence[Job], topics: list[str] | None) -> list[Cell]:
+def _run(
+    rec: Recording, source: StudyRecording, jobs: Sequence[Job], topics: list[str] | None
+) -> list[StudyCell]:
     """Replay one recording through all methods in one pass."""
     for job in jobs:
         warm(job.method.estimator)
@@ -214,7 +216,7 @@ def _run(rec: Recording, source: Source, jobs: Sequence[Job], topics: list[str] 
     ]
     result = replay(rec, specs, inputs=topics)
     imported = _import_findings(rec)
-    cells: list[Cell] = []
+    cells: list[StudyCell] = []
     for run in result.runs:
         job = jobs[int(run.run.partition("_")[0].removeprefix("m"))]
         own = [f for f in imported if _concerns(f, run.input, rec)]

@@ -30,7 +30,7 @@ class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     """One TOML table."""
 
 
-class Truth(_Table, frozen=True, kw_only=True):
+class TruthRule(_Table, frozen=True, kw_only=True):
     """What is known about the walks whose file name matches.
 
     Attributes
@@ -59,14 +59,14 @@ class Recordings(_Table, frozen=True, kw_only=True):
         Importer for the raw files; None finds it by content. ``.mcap`` files are taken as they are.
     options : dict
         Options of the importer, as ``convert --set`` takes them.
-    truth : list of Truth
+    truth : list of TruthRule
         What is known about the walks; it goes into the recordings that the study converts.
     """
 
     files: list[str] = msgspec.field(default_factory=lambda: ["*"])
     format: str | None = None
     options: dict[str, Any] = {}
-    truth: list[Truth] = []
+    truth: list[TruthRule] = []
 
 
 class Simulate(_Table, frozen=True, kw_only=True):
@@ -436,6 +436,6 @@ def configuration(config: StudyConfig, name: str, topic: str) -> str:
     return "other" if config.configurations else "all"
 
 
-def truth(config: Recordings, name: str) -> Truth:
+def truth(config: Recordings, name: str) -> TruthRule:
     """Return what is known about the walk in the file called ``name``."""
-    return next((t for t in config.truth if re.search(t.pattern, name)), Truth())
+    return next((t for t in config.truth if re.search(t.pattern, name)), TruthRule())

@@ -66,7 +66,7 @@ class Executor:
         if scheduler is not None and workers is not None:
             raise UsageError("give either workers or a scheduler: a Dask cluster has workers of its own")
         self.processes = cores() if workers is None else workers
-        self._pool: _Pool | None = None
+        self._pool: WarmPool | None = None
         self._client: Any = None
         if scheduler is not None:
             self._client = _connect(scheduler)
@@ -84,7 +84,7 @@ class Executor:
     def warm_up(self, modules: Iterable[str], estimators: Iterable[str]) -> None:
         """Start the processes without waiting for them; they load these modules and estimators' kernels."""
         if self._client is None and self.processes > 1 and self._pool is None:
-            self._pool = _Pool(self.processes, modules, estimators)
+            self._pool = WarmPool(self.processes, modules, estimators)
 
     def run(
         self,
@@ -120,7 +120,7 @@ class Executor:
             # Four tasks a worker: none waits for the parent, and a broken pool loses little.
             while waiting and len(running) < 4 * self.processes and not lost:
                 if self._pool is None:
-                    self._pool = _Pool(self.processes)
+                    self._pool = WarmPool(self.processes)
                 task = waiting.popleft()
                 try:
                     running[self._pool.submit(function, task)] = task
@@ -188,7 +188,7 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
                 os.environ[key] = value
 
 
-class _Pool:
+class WarmPool:
     """Processes that start while this one goes on.
 
     Parameters
@@ -273,7 +273,7 @@ def _stop_server() -> None:
 def _one_by_one(function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[Outcome[T, R]]:
     """Find out which task kills its worker: each gets a process of its own."""
     for task in tasks:
-        pool = _Pool(1)
+        pool = WarmPool(1)
         try:
             yield task, pool.submit(_attempt, function, task).result()
         except BrokenProcessPool:

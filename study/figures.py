@@ -23,7 +23,7 @@ from matplotlib.ticker import LogFormatter
 
 from . import config as cfg
 from .analysis import order
-from .cells import Cell
+from .cells import StudyCell
 from .report import NEES_TITLES
 from .statistics import normal_quantiles
 
@@ -224,9 +224,9 @@ def qq(frame: pl.DataFrame, config: cfg.StudyConfig) -> Figure | None:
     return figure
 
 
-def tracks(cells: Sequence[Cell], config: cfg.StudyConfig) -> Figure | None:
+def tracks(cells: Sequence[StudyCell], config: cfg.StudyConfig) -> Figure | None:
     """Overlaid tracks seen from above, a panel a configuration × filter."""
-    drawn: dict[tuple[str, str], list[Cell]] = {}
+    drawn: dict[tuple[str, str], list[StudyCell]] = {}
     for cell in cells:
         if cell.status == "ok" and len(cell.positions) > 1:
             drawn.setdefault((cell.label, cell.configuration), []).append(cell)
@@ -261,7 +261,7 @@ def tracks(cells: Sequence[Cell], config: cfg.StudyConfig) -> Figure | None:
     return figure
 
 
-def _overlay(ax: Axes, cells: Sequence[Cell], face: str, middle: np.ndarray, reach: float) -> None:
+def _overlay(ax: Axes, cells: Sequence[StudyCell], face: str, middle: np.ndarray, reach: float) -> None:
     """Draw one panel of tracks."""
     alpha = min(1.0, max(0.15, 4 / max(1, len(cells))))
     paths = [cell.positions[:, :2] for cell in cells]

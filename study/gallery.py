@@ -12,10 +12,10 @@ from typing import Any
 import msgspec
 import polars as pl
 
-from ..viz.page import Picture
+from ..viz.page import PagePicture
 from . import config as cfg
 from .analysis import order
-from .cells import Cell
+from .cells import StudyCell
 from .executors import Executor
 
 
@@ -25,7 +25,7 @@ class Drawing(msgspec.Struct, frozen=True):
     Attributes
     ----------
     name, section, caption : str
-        See :class:`~marcha.viz.page.Picture`.
+        See :class:`~marcha.viz.page.PagePicture`.
     function : str
         Name of the function of :mod:`~marcha.study.figures` that returns it, or None.
     arguments : tuple
@@ -40,7 +40,7 @@ class Drawing(msgspec.Struct, frozen=True):
 
 
 def drawings(
-    frame: pl.DataFrame, nees: pl.DataFrame, cells: Sequence[Cell], config: cfg.StudyConfig
+    frame: pl.DataFrame, nees: pl.DataFrame, cells: Sequence[StudyCell], config: cfg.StudyConfig
 ) -> list[Drawing]:
     """Return all that the study has to show, in the order of the report; see :func:`draw`."""
     levels = order(frame, config)
@@ -85,22 +85,22 @@ def drawings(
     return found
 
 
-def render(drawing: Drawing) -> Picture | None:
+def render(drawing: Drawing) -> PagePicture | None:
     """Draw one figure; None where there is nothing to see."""
     from . import figures
 
     images = figures.images(getattr(figures, drawing.function), *drawing.arguments)
-    return None if images is None else Picture(drawing.name, drawing.section, drawing.caption, *images)
+    return None if images is None else PagePicture(drawing.name, drawing.section, drawing.caption, *images)
 
 
 def draw(
     executor: Executor,
     values: pl.DataFrame,
     consistency: pl.DataFrame,
-    cells: Sequence[Cell],
+    cells: Sequence[StudyCell],
     config: cfg.StudyConfig,
     meanwhile: Callable[[], object] = lambda: None,
-) -> list[Picture]:
+) -> list[PagePicture]:
     """Draw every figure, by the processes that are there.
 
     Parameters
@@ -109,7 +109,7 @@ def draw(
         Runs the drawing.
     values, consistency : polars.DataFrame
         Tables of :mod:`~marcha.study.analysis`.
-    cells : sequence of Cell
+    cells : sequence of StudyCell
         Their tracks are drawn.
     config : StudyConfig
         The study.
@@ -117,7 +117,7 @@ def draw(
         See :meth:`Executor.run`.
     """
     todo = drawings(values, consistency, cells, config)
-    done: dict[str, Picture | None] = {}
+    done: dict[str, PagePicture | None] = {}
     # From the end of the report, where the largest figures stand: none of them is begun last.
     for drawing, outcome in executor.run(render, todo[::-1], meanwhile):
         if isinstance(outcome, Exception):

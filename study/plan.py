@@ -25,7 +25,7 @@ from ..recording import UsageError
 from . import config as cfg
 
 
-class Source(msgspec.Struct, frozen=True):
+class StudyRecording(msgspec.Struct, frozen=True):
     """One recording of the study.
 
     Attributes
@@ -78,14 +78,14 @@ class Job(msgspec.Struct, frozen=True):
     method: cfg.Method
 
 
-class Task(msgspec.Struct, frozen=True):
+class StudyTask(msgspec.Struct, frozen=True):
     """What one worker does at a time: jobs on one recording, which is read once for all of them.
 
     Attributes
     ----------
     name : str
         Hash of the jobs' keys, name of the task's file.
-    source : Source
+    source : StudyRecording
         The recording.
     jobs : list of Job
         What runs on it; empty to only convert it.
@@ -96,7 +96,7 @@ class Task(msgspec.Struct, frozen=True):
     """
 
     name: str
-    source: Source
+    source: StudyRecording
     jobs: list[Job]
     inputs: list[str]
     folder: str
@@ -121,9 +121,9 @@ def file_digest(path: Path) -> str:
 
 
 def code_digest(estimators: Iterable[str]) -> str:
-    """Return a hash of the code that results depend on: marcha's rooms and version, plug-ins' modules."""
+    """Return a hash of the code that results depend on: marcha's packages and version, plug-ins' modules."""
     root = Path(__file__).parents[2]
-    files = [p for room in ("recording", "ingest", "algorithms") for p in (root / room).rglob("*.py")]
+    files = [p for package in ("recording", "ingest", "algorithms") for p in (root / package).rglob("*.py")]
     files += (root / "replay").glob("*.py")
     files.append(Path(__file__).with_name("cells.py"))
     classes = available()
@@ -143,7 +143,7 @@ def code_digest(estimators: Iterable[str]) -> str:
 
 def find_sources(
     config: cfg.StudyConfig, data: Path | Sequence[Path] | None, code: str
-) -> tuple[list[Source], list[str]]:
+) -> tuple[list[StudyRecording], list[str]]:
     """Return the study's recordings in the order of their names, and remarks about what was left out.
 
     Raises
@@ -151,7 +151,7 @@ def find_sources(
     UsageError
         For a missing data folder or globs that match nothing.
     """
-    sources: list[Source] = []
+    sources: list[StudyRecording] = []
     notes: list[str] = []
     if config.recordings is not None:
         found, notes = _files(config.recordings, data)
@@ -197,14 +197,16 @@ def _files(
     return sorted(names.items()), notes
 
 
-def _source(recordings: cfg.Recordings, name: str, path: Path, code: str) -> Source:
+def _source(recordings: cfg.Recordings, name: str, path: Path, code: str) -> StudyRecording:
     raw = path.suffix != ".mcap"
     beside = sorted(path.parent.glob(f"{glob.escape(path.stem)}.truth.*")) if raw else []
-    known = cfg.Truth() if beside else cfg.truth(recordings, path.name)  # what a walk knows of itself counts
+    known = (
+        cfg.TruthRule() if beside else cfg.truth(recordings, path.name)
+    )  # what a walk knows of itself counts
     truth = {k: v for k, v in (("closed", known.closed), ("length_m", known.length_m)) if v is not None}
     options = {**truth, **recordings.options} if raw else truth
     content = [file_digest(p) for p in (path, *beside)]
-    return Source(
+    return StudyRecording(
         name=name,
         kind="raw" if raw else "mcap",
         digest=digest(content, path.name, recordings.format if raw else None, options, code),
@@ -215,8 +217,8 @@ def _source(recordings: cfg.Recordings, name: str, path: Path, code: str) -> Sou
     )
 
 
-def _walks(simulate: cfg.Simulate, code: str) -> list[Source]:
-    walks: list[Source] = []
+def _walks(simulate: cfg.Simulate, code: str) -> list[StudyRecording]:
+    walks: list[StudyRecording] = []
     several = len(simulate.scenarios) > 1
     for scenario in simulate.scenarios:
         for label, sensor in simulate.configurations.items():
@@ -226,7 +228,7 @@ def _walks(simulate: cfg.Simulate, code: str) -> list[Source]:
                 varied = {k: draw.uniform(*simulate.vary[k]) for k in sorted(simulate.vary)}
                 options = {**simulate.options, **varied, **sensor}
                 walks.append(
-                    Source(
+                    StudyRecording(
                         name=f"{scenario}-{label}-{number:03d}",
                         kind="simulated",
                         digest=digest(scenario, seed, options, code),
@@ -239,7 +241,7 @@ def _walks(simulate: cfg.Simulate, code: str) -> list[Source]:
     return walks
 
 
-def jobs(config: cfg.StudyConfig, source: Source) -> list[Job]:
+def jobs(config: cfg.StudyConfig, source: StudyRecording) -> list[Job]:
     """Return every method on one recording with its key."""
     return [
         Job(digest(source.digest, source.name, config.inputs, method), method)
@@ -263,20 +265,24 @@ def check_methods(methods: Iterable[cfg.Method]) -> None:
 
 
 def tasks(
-    config: cfg.StudyConfig, sources: Sequence[Source], done: Iterable[str], folder: Path, processes: int
-) -> list[Task]:
+    config: cfg.StudyConfig,
+    sources: Sequence[StudyRecording],
+    done: Iterable[str],
+    folder: Path,
+    processes: int,
+) -> list[StudyTask]:
     """Return what is left to do: a task a recording, more where recordings are fewer than processes."""
     finished = set(done)
     left = [(s, [j for j in jobs(config, s) if j.key not in finished]) for s in sources]
     left = [(s, js) for s, js in left if js]
     pieces = max(1, -(-4 * processes // len(left))) if left and len(left) < 2 * processes else 1
-    result: list[Task] = []
+    result: list[StudyTask] = []
     for source, todo in left:
         size = -(-len(todo) // pieces)
         for start in range(0, len(todo), size):
             part = todo[start : start + size]
             result.append(
-                Task(
+                StudyTask(
                     name=digest([j.key for j in part]),
                     source=source,
                     jobs=part,
@@ -288,7 +294,7 @@ def tasks(
     return sorted(result, key=lambda t: (-t.source.size, t.source.name))
 
 
-def preparations(todo: Sequence[Task]) -> list[Task]:
+def preparations(todo: Sequence[StudyTask]) -> list[StudyTask]:
     """Return a task without jobs for every recording that several tasks share: it is made once, first."""
     counts = Counter(task.source.name for task in todo)
     shared = {task.source.name: task for task in todo if counts[task.source.name] > 1}

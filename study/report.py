@@ -10,12 +10,12 @@ from typing import Any
 import msgspec
 import polars as pl
 
-from ..viz.page import Html, Picture, number
+from ..viz.page import Html, PagePicture, number
 from . import config as cfg
 from .analysis import order
 
 
-class Material(msgspec.Struct, frozen=True):
+class ReportContents(msgspec.Struct, frozen=True):
     """Everything that the report is made of.
 
     Attributes
@@ -67,30 +67,30 @@ def mean_sd(row: dict[str, Any] | None) -> str:
     return f"{text} ± {sd}"
 
 
-def render(material: Material, pictures: Sequence[Picture]) -> str:
+def render(contents: ReportContents, pictures: Sequence[PagePicture]) -> str:
     """Return the report as one HTML page."""
     html = Html()
-    _introduction(html, material)
-    levels = order(material.values, material.config)
-    if len(material.values):
-        _means(html, material, levels)
-        if len(levels["detector"]) > 1 or material.values["clipped"].n_unique() > 1:
-            _methods(html, material, levels)
+    _introduction(html, contents)
+    levels = order(contents.values, contents.config)
+    if len(contents.values):
+        _means(html, contents, levels)
+        if len(levels["detector"]) > 1 or contents.values["clipped"].n_unique() > 1:
+            _methods(html, contents, levels)
         for title, section in (("Box plots", "box"), ("Tracks", "tracks"), ("Run time", "run time")):
             _gallery(html, pictures, title, section)
-        if len(material.consistency):
-            _consistency(html, material, pictures)
-        _normality(html, material, pictures)
-        _comparisons(html, material)
-        _outliers(html, material)
-    _origin(html, material)
-    return html.page(material.config.title)
+        if len(contents.consistency):
+            _consistency(html, contents, pictures)
+        _normality(html, contents, pictures)
+        _comparisons(html, contents)
+        _outliers(html, contents)
+    _origin(html, contents)
+    return html.page(contents.config.title)
 
 
-def _introduction(html: Html, material: Material) -> None:
-    results = material.results
-    if material.config.description:
-        html.text(material.config.description)
+def _introduction(html: Html, contents: ReportContents) -> None:
+    results = contents.results
+    if contents.config.description:
+        html.text(contents.config.description)
     walks, clipped = results["recording"].n_unique(), results.filter("clipped")["recording"].n_unique()
     done = results.filter(pl.col("status") == "ok")
     html.text(
@@ -100,7 +100,7 @@ def _introduction(html: Html, material: Material) -> None:
         f"{_count(clipped, 'recording')} with clipped inputs. "
         f"A cell is one filter with one detector on one input of one recording."
     )
-    html.warning(material.notes)
+    html.warning(contents.notes)
 
 
 def _count(number: int, noun: str) -> str:
@@ -114,19 +114,19 @@ def _lookup(groups: pl.DataFrame, subset: str = "all") -> dict[tuple[str, str, s
     }
 
 
-def _means(html: Html, material: Material, levels: dict[str, list[str]]) -> None:
+def _means(html: Html, contents: ReportContents, levels: dict[str, list[str]]) -> None:
     html.section("Means by filter and configuration")
     first = levels["detector"][0]
-    found = _lookup(material.groups)
+    found = _lookup(contents.groups)
     shares = {
         (r["configuration"],): r["share"]
-        for r in material.results.group_by("configuration")
+        for r in contents.results.group_by("configuration")
         .agg(share=pl.col("clipped").mean())
         .iter_rows(named=True)
     }
     beside = {
         (r["metric"], r["filter"], r["detector"], r["configuration"]): r["published"]
-        for r in material.published.filter(pl.col("by") == "estimator").iter_rows(named=True)
+        for r in contents.published.filter(pl.col("by") == "estimator").iter_rows(named=True)
     }
     clipped = ", ".join(
         f"{c} ({100 * shares[(c,)]:.0f} %)" for c in levels["configuration"] if shares.get((c,))
@@ -136,11 +136,11 @@ def _means(html: Html, material: Material, levels: dict[str, list[str]]) -> None
         + (f"; detector {first}" if first else "")
         + (f". Inputs that reached their full scale, by configuration: {clipped}." if clipped else ".")
     )
-    for metric in material.config.metrics:
+    for metric in contents.config.metrics:
         title = cfg.metric_title(metric)
         if not any(k[0] == title for k in found):
             continue
-        tables = [t for t in material.config.published if t.metric == title and t.by == "estimator"]
+        tables = [t for t in contents.config.published if t.metric == title and t.by == "estimator"]
         html.heading(f"{title} ({metric.unit})" if metric.unit else title)
         rows: list[list[str]] = []
         for name in levels["filter"]:
@@ -157,12 +157,12 @@ def _means(html: Html, material: Material, levels: dict[str, list[str]]) -> None
         html.table(["filter", *levels["configuration"], "all"], rows)
         for table in tables:
             html.text(f"Published: {table.origin} {table.note}".strip(), "note")
-    if (material.published["by"] == "detector").any():
-        _published_detectors(html, material)
+    if (contents.published["by"] == "detector").any():
+        _published_detectors(html, contents)
 
 
-def _published_detectors(html: Html, material: Material) -> None:
-    part = material.published.filter(pl.col("by") == "detector")
+def _published_detectors(html: Html, contents: ReportContents) -> None:
+    part = contents.published.filter(pl.col("by") == "detector")
     html.heading("Detectors, beside the published means")
     rows = []
     for r in part.iter_rows(named=True):
@@ -189,19 +189,19 @@ def _published_detectors(html: Html, material: Material) -> None:
             html.text(note, "note")
 
 
-def _methods(html: Html, material: Material, levels: dict[str, list[str]]) -> None:
+def _methods(html: Html, contents: ReportContents, levels: dict[str, list[str]]) -> None:
     html.section("Every filter and detector, clipped inputs apart")
     html.text(
         "Mean ± standard deviation over all configurations. An input is clipped where a sensor reached its "
         "full scale: "
         "what it did beyond is not in the data, so its errors are not the filter's alone."
     )
-    titles = [cfg.metric_title(m) for m in material.config.metrics]
-    units = {cfg.metric_title(m): m.unit for m in material.config.metrics}
-    subsets = [s for s in ("unclipped", "clipped") if (material.groups["subset"] == s).any()] or ["all"]
+    titles = [cfg.metric_title(m) for m in contents.config.metrics]
+    units = {cfg.metric_title(m): m.unit for m in contents.config.metrics}
+    subsets = [s for s in ("unclipped", "clipped") if (contents.groups["subset"] == s).any()] or ["all"]
     rows: list[list[str]] = []
     for subset in subsets:
-        found = _lookup(material.groups, subset)
+        found = _lookup(contents.groups, subset)
         body: list[list[str]] = []
         for name in levels["filter"]:
             for detector in levels["detector"]:
@@ -215,7 +215,7 @@ def _methods(html: Html, material: Material, levels: dict[str, list[str]]) -> No
     html.table(["filter", "detector", *head, "n"], rows, 2)
 
 
-def _gallery(html: Html, pictures: Sequence[Picture], title: str, section: str) -> None:
+def _gallery(html: Html, pictures: Sequence[PagePicture], title: str, section: str) -> None:
     pictures = [p for p in pictures if p.section == section]
     if pictures:
         html.section(title)
@@ -229,21 +229,21 @@ def _gallery(html: Html, pictures: Sequence[Picture], title: str, section: str) 
         html.pictures(pictures)
 
 
-def _consistency(html: Html, material: Material, pictures: Sequence[Picture]) -> None:
+def _consistency(html: Html, contents: ReportContents, pictures: Sequence[PagePicture]) -> None:
     html.section("Consistency of the filters' own covariance")
     html.text(
         "NEES: the squared error at the end of the walk in units of the filter's own standard deviations (3 "
         "on average in space). Its mean over independent walks lies in the interval if "
         "the filter knows how wrong it is; above it is too sure, below it too careful."
     )
-    table = material.consistency
+    table = contents.consistency
     if table["clipped"].any():
         html.text(
             "Clipped inputs stand apart: what a sensor did beyond its full scale is in no model, so there no "
             "filter can be consistent, and every error counts against it.",
             "note",
         )
-    levels = order(table, material.config)
+    levels = order(table, contents.config)
     for (metric,), errors in table.group_by("metric", maintain_order=True):
         html.heading(f"{NEES_TITLES.get(str(metric), str(metric))}: mean NEES")
         rows: list[list[str]] = []
@@ -284,10 +284,10 @@ def _verdict(row: dict[str, Any] | None) -> str:
     return f"{mark}{number(row['mean'])} {row['verdict']}"
 
 
-def _normality(html: Html, material: Material, pictures: Sequence[Picture]) -> None:
+def _normality(html: Html, contents: ReportContents, pictures: Sequence[PagePicture]) -> None:
     html.section("Normality")
-    level = 1 - material.config.statistics.confidence
-    tested = material.groups.filter(
+    level = 1 - contents.config.statistics.confidence
+    tested = contents.groups.filter(
         (pl.col("subset") == "all") & (pl.col("configuration") != "") & (pl.col("filter") != "")
     )
     html.text(
@@ -329,8 +329,8 @@ def _folded(html: Html, title: str, head: Sequence[str], rows: list[list[str]], 
     html.parts.append("</details>")
 
 
-def _comparisons(html: Html, material: Material) -> None:
-    statistics = material.config.statistics
+def _comparisons(html: Html, contents: ReportContents) -> None:
+    statistics = contents.config.statistics
     level = 1 - statistics.confidence
     twin = {"mann-whitney": "Mann-Whitney U", "brunner-munzel": "Brunner-Munzel"}[statistics.nonparametric]
     html.section("Which means differ")
@@ -343,7 +343,7 @@ def _comparisons(html: Html, material: Material) -> None:
         "which makes "
         "them careful between filters."
     )
-    table = material.comparisons
+    table = contents.comparisons
     done = table.filter(pl.col("welch_p").is_finite())
     if len(done) < len(table):
         html.text(
@@ -391,15 +391,15 @@ def _comparisons(html: Html, material: Material) -> None:
             html.parts.append("</details>")
 
 
-def _outliers(html: Html, material: Material) -> None:
+def _outliers(html: Html, contents: ReportContents) -> None:
     html.section("Outliers")
-    sigma = material.config.statistics.outlier_sigma
+    sigma = contents.config.statistics.outlier_sigma
     if sigma == 0:
         html.text("No value is left out: the rule is switched off.")
         return
-    count = len(material.outliers)
+    count = len(contents.outliers)
     html.text(
-        f"{count} of {len(material.values)} values lie more than {sigma:g} standard deviations from the mean "
+        f"{count} of {len(contents.values)} values lie more than {sigma:g} standard deviations from the mean "
         "of their filter × "
         "detector × configuration and are left out of means, plots and tests. "
         f"Among n values none can lie beyond (n − 1)/√n, so the rule needs {_least(sigma)} values to strike."
@@ -408,7 +408,7 @@ def _outliers(html: Html, material: Material) -> None:
         head = ["metric", "filter", "detector", "configuration", "recording", "input", "value"]
         rows = [
             [*(escape(str(r[c])) for c in head[:-1]), f"{number(r['value'])} {escape(r['unit'])}"]
-            for r in material.outliers.iter_rows(named=True)
+            for r in contents.outliers.iter_rows(named=True)
         ]
         _folded(html, f"{count} values", head, rows, 6)
 
@@ -420,10 +420,10 @@ def _least(sigma: float) -> int:
     return n
 
 
-def _origin(html: Html, material: Material) -> None:
+def _origin(html: Html, contents: ReportContents) -> None:
     html.section("Provenance")
-    rows = [[escape(k), escape(str(v))] for k, v in material.provenance.items()]
+    rows = [[escape(k), escape(str(v))] for k, v in contents.provenance.items()]
     html.table(["", ""], rows, 2)
     html.parts.append(
-        f"<details><summary>Configuration</summary><pre>{escape(material.toml)}</pre></details>"
+        f"<details><summary>Configuration</summary><pre>{escape(contents.toml)}</pre></details>"
     )

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 NAN = math.nan
 
 
-class Group(msgspec.Struct, frozen=True):
+class GroupSummary(msgspec.Struct, frozen=True):
     """Summary of one group's values.
 
     Attributes
@@ -53,7 +53,7 @@ class Group(msgspec.Struct, frozen=True):
     note: str = ""
 
 
-class Comparison(msgspec.Struct, frozen=True):
+class GroupComparison(msgspec.Struct, frozen=True):
     """Two groups compared.
 
     Attributes
@@ -114,7 +114,7 @@ def kept(values: ArrayLike, sigma: float) -> NDArray[np.float64]:
     return x[np.isfinite(x) & ~outlier_mask(x, sigma)]
 
 
-def summarize(values: ArrayLike, *, sigma: float = 3.0, min_samples: int = 3) -> Group:
+def summarize(values: ArrayLike, *, sigma: float = 3.0, min_samples: int = 3) -> GroupSummary:
     """Summarize one group: outliers by the sigma rule, moments, Shapiro-Wilk."""
     from scipy import stats
 
@@ -134,7 +134,7 @@ def summarize(values: ArrayLike, *, sigma: float = 3.0, min_samples: int = 3) ->
         if n > 5000:
             note = "Shapiro-Wilk is not accurate above 5000 values"
     empty = n == 0
-    return Group(
+    return GroupSummary(
         n=n,
         outliers=outliers,
         missing=missing,
@@ -179,18 +179,18 @@ def compare(
     confidence: float = 0.95,
     min_samples: int = 3,
     nonparametric: Literal["mann-whitney", "brunner-munzel"] = "mann-whitney",
-) -> Comparison:
+) -> GroupComparison:
     """Compare two independent samples (finite values, outliers left out by the caller)."""
     from scipy import stats
 
     x, y = np.asarray(a, float), np.asarray(b, float)
     n, k = len(x), len(y)
     if min(n, k) < min_samples:
-        return Comparison(n, k, note=f"not tested: {n} and {k} values, {min_samples} each needed")
+        return GroupComparison(n, k, note=f"not tested: {n} and {k} values, {min_samples} each needed")
     scale = max(np.abs(x).max(), np.abs(y).max())
     if x.std(ddof=1) + y.std(ddof=1) <= 1e-12 * scale:
         difference = float(x.mean() - y.mean())
-        return Comparison(n, k, difference=difference, note="not tested: no spread in either group")
+        return GroupComparison(n, k, difference=difference, note="not tested: no spread in either group")
     welch: Any = stats.ttest_ind(x, y, equal_var=False)
     low, high = welch.confidence_interval(confidence)
     g, g_low, g_high = hedges_g(x, y, confidence)
@@ -199,7 +199,7 @@ def compare(
     else:
         with np.errstate(all="ignore"):
             rank_p = float(stats.brunnermunzel(x, y).pvalue)
-    return Comparison(
+    return GroupComparison(
         n_a=n,
         n_b=k,
         difference=float(x.mean() - y.mean()),
@@ -226,7 +226,7 @@ def holm(p_values: ArrayLike) -> NDArray[np.float64]:
     return adjusted
 
 
-def corrected(family: Sequence[Comparison]) -> list[Comparison]:
+def corrected(family: Sequence[GroupComparison]) -> list[GroupComparison]:
     """Return the comparisons of one family with their p values corrected by Holm, both tests apart."""
     welch = holm([c.welch_p for c in family])
     rank = holm([c.rank_p for c in family])

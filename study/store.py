@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import polars as pl
 
-from .cells import Cell
+from .cells import StudyCell
 
 
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
@@ -37,11 +37,11 @@ class CellStore:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._encode = msgspec.msgpack.Encoder().encode
-        self._decode = msgspec.msgpack.Decoder(list[Cell]).decode
+        self._decode = msgspec.msgpack.Decoder(list[StudyCell]).decode
 
-    def load(self) -> dict[str, list[Cell]]:
+    def load(self) -> dict[str, list[StudyCell]]:
         """Return the finished cells by their job's key. Failed ones are left out: they are tried again."""
-        jobs: dict[str, list[Cell]] = {}
+        jobs: dict[str, list[StudyCell]] = {}
         for path in sorted(self.folder.glob("*.msgpack")):
             try:
                 cells = self._decode(path.read_bytes())
@@ -51,13 +51,13 @@ class CellStore:
                 jobs.setdefault(cell.key, []).append(cell)
         return {key: cells for key, cells in jobs.items() if all(c.status == "ok" for c in cells)}
 
-    def add(self, name: str, cells: Iterable[Cell]) -> None:
+    def add(self, name: str, cells: Iterable[StudyCell]) -> None:
         """Keep the cells of one finished task under the file name ``name``."""
         data = self._encode(list(cells))
         write_atomic(self.folder / f"{name}.msgpack", lambda path: path.write_bytes(data))
 
 
-def tidy(cells: Iterable[Cell]) -> pl.DataFrame:
+def tidy(cells: Iterable[StudyCell]) -> pl.DataFrame:
     """Return one row a cell: what ran on what, how it ended, and a column a metric."""
     cells = list(cells)
     names = sorted({name for cell in cells for name in cell.metrics})

@@ -16,18 +16,18 @@ import msgspec
 import polars as pl
 
 from ..recording import MarchaError, OutputExists, UsageError
-from ..viz.page import Picture
+from ..viz.page import PagePicture
 from . import analysis, plan
 from . import config as cfg
 from .cells import (
-    Cell,
+    StudyCell,
     cached,
     failed,
     run_task,
 )
 from .executors import Executor
 from .gallery import draw
-from .report import Material, render
+from .report import ReportContents, render
 from .store import CellStore, tidy, write_atomic
 
 TABLES = ("results", "values", "groups", "comparisons", "outliers", "published", "consistency")
@@ -175,7 +175,7 @@ def run_study(
         code = plan.code_digest(m.estimator for m in methods)
         plan.check_methods(methods)
         sources, notes = plan.find_sources(config, (roots[0] if len(roots) == 1 else roots) or None, code)
-        _claim(folder, toml, overwrite=overwrite, resume=resume)
+        _take_folder(folder, toml, overwrite=overwrite, resume=resume)
 
         store = CellStore(folder / "cells")
         finished = store.load()
@@ -197,7 +197,9 @@ def run_study(
             done += len(task.jobs)
             if progress:
                 progress(done, total)
-        cells = [_placed(cell, source, config) for source, job in wanted for cell in finished[job.key]]
+        cells = [
+            _with_configuration(cell, source, config) for source, job in wanted for cell in finished[job.key]
+        ]
         _forget_old_recordings(folder / "recordings", sources)
         results = tidy(cells)
         values = analysis.values(results, config)
@@ -214,7 +216,7 @@ def run_study(
             ),
         )
     groups, comparisons = tables
-    material = Material(
+    contents = ReportContents(
         config=config,
         results=results,
         values=values,
@@ -227,16 +229,16 @@ def run_study(
         provenance=_provenance(code, started, scheduler or f"{executor.processes} processes"),
         toml=toml,
     )
-    files = _write(folder, material, pictures)
+    files = _write(folder, contents, pictures)
     return StudyResult(
         folder=folder,
         config=config,
-        **{name: getattr(material, name) for name in TABLES},
+        **{name: getattr(contents, name) for name in TABLES},
         cells_run=sum(c.key not in reused for c in cells),
         cells_reused=sum(c.key in reused for c in cells),
         cells_failed=sum(c.status != "ok" for c in cells),
         elapsed_s=time.perf_counter() - begin,
-        notes=material.notes,
+        notes=contents.notes,
         files=files,
     )
 
@@ -252,7 +254,7 @@ def _plain(config: cfg.StudyConfig) -> Any:
     return clean(msgspec.to_builtins(config))
 
 
-def _claim(folder: Path, toml: str, *, overwrite: bool, resume: bool) -> None:
+def _take_folder(folder: Path, toml: str, *, overwrite: bool, resume: bool) -> None:
     """Make the folder the study's own, or refuse."""
     known = folder / "study.toml"
     if folder.exists() and not folder.is_dir():
@@ -272,14 +274,14 @@ def _claim(folder: Path, toml: str, *, overwrite: bool, resume: bool) -> None:
     write_atomic(known, lambda path: path.write_text(toml, encoding="utf-8"))
 
 
-def _placed(cell: Cell, source: plan.Source, config: cfg.StudyConfig) -> Cell:
+def _with_configuration(cell: StudyCell, source: plan.StudyRecording, config: cfg.StudyConfig) -> StudyCell:
     label = source.configuration
     if config.configurations or not label:
         label = cfg.configuration(config, label or Path(source.path).name, cell.input)
     return msgspec.structs.replace(cell, configuration=label)
 
 
-def _forget_old_recordings(folder: Path, sources: Sequence[plan.Source]) -> None:
+def _forget_old_recordings(folder: Path, sources: Sequence[plan.StudyRecording]) -> None:
     """Remove converted recordings that no source of this study needs any more."""
     needed = {cached(s, folder).name for s in sources}
     for path in folder.glob("*.mcap") if folder.is_dir() else ():
@@ -299,16 +301,16 @@ def _provenance(code: str, started: datetime, executor: str) -> dict[str, str]:
     }
 
 
-def _write(folder: Path, material: Material, pictures: list[Picture]) -> list[Path]:
+def _write(folder: Path, contents: ReportContents, pictures: list[PagePicture]) -> list[Path]:
     """Write tables, figures and report; return the files. Older figures are removed."""
-    page = render(material, pictures)
-    provenance = msgspec.json.format(msgspec.json.encode(material.provenance))
+    page = render(contents, pictures)
+    provenance = msgspec.json.format(msgspec.json.encode(contents.provenance))
     writers: dict[str, Callable[[Path], object]] = {
-        "results.parquet": material.results.write_parquet,
-        "results.csv": material.results.write_csv,
-        "groups.csv": material.groups.write_csv,
-        "comparisons.csv": material.comparisons.write_csv,
-        "outliers.csv": material.outliers.write_csv,
+        "results.parquet": contents.results.write_parquet,
+        "results.csv": contents.results.write_csv,
+        "groups.csv": contents.groups.write_csv,
+        "comparisons.csv": contents.comparisons.write_csv,
+        "outliers.csv": contents.outliers.write_csv,
         "provenance.json": lambda path: path.write_bytes(provenance),
         "report.html": lambda path: path.write_text(page, encoding="utf-8"),
     }

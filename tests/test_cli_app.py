@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from marcha.cli import contents
 from marcha.cli.app import COMMANDS
-from marcha.cli.console import Table, folded, number
+from marcha.cli.console import TextTable, folded, number
 from marcha.cli.options import instant, limits, settings
 from marcha.cli.reference import page
 from marcha.recording import UsageError
@@ -208,7 +208,7 @@ def test_completion_is_installed_for_the_user(tmp_path: Path) -> None:
 
 
 def test_a_table_wider_than_the_terminal_is_folded() -> None:
-    table = Table(
+    table = TextTable(
         ["metric", ">first_run", ">second_run", ">third"], [["closure_m", 1.5, 2.0, 33.0]], fold=True
     )
     pieces = folded(table, 24)
@@ -218,7 +218,7 @@ def test_a_table_wider_than_the_terminal_is_folded() -> None:
         ["metric", ">third"],
     ]
     assert [list(p.rows[0]) for p in pieces] == [["closure_m", 1.5], ["closure_m", 2.0], ["closure_m", 33.0]]
-    assert folded(table, 80) == [Table(table.columns, [list(table.rows[0])])]
+    assert folded(table, 80) == [TextTable(table.columns, [list(table.rows[0])])]
 
 
 # -- progress and colour ----------------------------------------------------------------------------

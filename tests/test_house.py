@@ -1,4 +1,4 @@
-"""The house: which room may import which, and that every room is shipped."""
+"""Structure: which package may import which, and that every package is shipped."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 
 from .conftest import ROOT
 
-ROOMS = ("ingest", "recording", "algorithms", "replay", "study", "viz", "export", "cli")
+PACKAGES = ("ingest", "recording", "algorithms", "replay", "study", "viz", "export", "cli")
 MAY_IMPORT = {
     "recording": set(),
     "algorithms": set(),
@@ -21,9 +21,9 @@ MAY_IMPORT = {
     "replay": {"recording", "algorithms"},
     "study": {"recording", "algorithms", "replay", "ingest", "viz"},
     "viz": {"recording", "replay", "export"},  # export: only for the contract that its RRD exporter fulfils
-    "cli": set(ROOMS) - {"cli"},
+    "cli": set(PACKAGES) - {"cli"},
 }
-SOURCES = sorted(p for room in ROOMS for p in (ROOT / room).rglob("*.py"))
+SOURCES = sorted(p for package in PACKAGES for p in (ROOT / package).rglob("*.py"))
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 
 
@@ -47,15 +47,15 @@ def imports(path: Path) -> list[tuple[int, str]]:
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
 def test_imports_point_against_the_data_flow(path: Path) -> None:
-    room = path.relative_to(ROOT).parts[0]
+    package = path.relative_to(ROOT).parts[0]
     for line, name in imports(path):
         parts = name.split(".")
-        if parts[0] == "marcha" and len(parts) > 1 and parts[1] in ROOMS and parts[1] != room:
-            assert parts[1] in MAY_IMPORT[room], f"{path}:{line}: {room} may not import {parts[1]}"
+        if parts[0] == "marcha" and len(parts) > 1 and parts[1] in PACKAGES and parts[1] != package:
+            assert parts[1] in MAY_IMPORT[package], f"{path}:{line}: {package} may not import {parts[1]}"
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
-def test_cross_room_imports_are_relative(path: Path) -> None:
+def test_imports_across_packages_are_relative(path: Path) -> None:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -64,7 +64,7 @@ def test_cross_room_imports_are_relative(path: Path) -> None:
             names = [node.module or ""]
         else:
             continue
-        assert not any(n.split(".")[0] in ("marcha", *ROOMS) for n in names), f"{path}:{node.lineno}"
+        assert not any(n.split(".")[0] in ("marcha", *PACKAGES) for n in names), f"{path}:{node.lineno}"
 
 
 def test_only_viz_imports_rerun() -> None:

@@ -10,7 +10,7 @@ import marcha.recording as mr
 import numpy as np
 import polars as pl
 import pytest
-from marcha.recording.threads import LIMIT, Ahead, helpers, threads
+from marcha.recording.threads import LIMIT, Prefetch, helpers, threads
 
 
 @pytest.mark.parametrize(("given", "most"), [("1", 1), ("2", 2), ("", 4), ("none", 4), ("0", 4), ("-3", 4)])
@@ -50,8 +50,8 @@ def test_reading_ahead_keeps_order_and_closes(
         finally:
             closed.append(True)
 
-    assert list(Ahead(numbers(), "test", depth)) == list(range(10))
-    early = Ahead(numbers(), "test", depth)
+    assert list(Prefetch(numbers(), "test", depth)) == list(range(10))
+    early = Prefetch(numbers(), "test", depth)
     assert next(early) == 0
     early.close()
     assert closed == [True, True]
@@ -68,7 +68,7 @@ def test_reading_ahead_closes_what_nobody_asked_for(monkeypatch: pytest.MonkeyPa
         finally:
             closed.append(True)
 
-    Ahead(numbers(), "test").close()
+    Prefetch(numbers(), "test").close()
     assert closed == [True]
     assert threading.active_count() == before
 
@@ -83,7 +83,7 @@ def test_reading_ahead_raises_where_the_item_would_have_been(
         yield 1
         raise ValueError("no second number")
 
-    items = Ahead(numbers(), "test")
+    items = Prefetch(numbers(), "test")
     assert next(items) == 1
     with pytest.raises(ValueError, match="no second number"):
         next(items)

@@ -11,7 +11,7 @@ import pytest
 from marcha.recording import UsageError
 from marcha.study import load, presets
 from marcha.study.config import StudyConfig, configuration, methods, truth
-from marcha.study.plan import Source, find_sources, jobs, tasks
+from marcha.study.plan import StudyRecording, find_sources, jobs, tasks
 
 MINIMAL = """
 [recordings]
@@ -214,8 +214,8 @@ def test_a_cell_is_another_one_when_anything_it_depends_on_changes(tmp_path: Pat
         assert key(parse(MINIMAL.replace("[[", "truth = [{ closed = true }]\n[[", 1), tmp_path)) != before
 
 
-def sources(count: int) -> list[Source]:
-    return [Source(name=f"r{i}", kind="mcap", digest=str(i), size=100 - i) for i in range(count)]
+def sources(count: int) -> list[StudyRecording]:
+    return [StudyRecording(name=f"r{i}", kind="mcap", digest=str(i), size=100 - i) for i in range(count)]
 
 
 def test_a_recording_is_read_once_for_all_its_methods(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from marcha.study.statistics import (
-    Comparison,
+    GroupComparison,
     compare,
     corrected,
     hedges_g,
@@ -114,7 +114,10 @@ def test_equal_values_are_said_and_not_tested() -> None:
 
 
 def test_a_family_is_corrected_test_by_test() -> None:
-    family = [Comparison(5, 5, welch_p=0.01, rank_p=0.04), Comparison(5, 5, welch_p=0.03, rank_p=0.02)]
+    family = [
+        GroupComparison(5, 5, welch_p=0.01, rank_p=0.04),
+        GroupComparison(5, 5, welch_p=0.03, rank_p=0.02),
+    ]
     done = corrected(family)
     assert [c.welch_p_holm for c in done] == pytest.approx([0.02, 0.03])
     assert [c.rank_p_holm for c in done] == pytest.approx([0.04, 0.04])

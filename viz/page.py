@@ -12,7 +12,7 @@ from string import Template
 import msgspec
 
 
-class Picture(msgspec.Struct, frozen=True):
+class PagePicture(msgspec.Struct, frozen=True):
     """A drawn figure.
 
     Attributes
@@ -99,7 +99,7 @@ class Html:
                 out += ["<tr>", *(cell("td", i, c) for i, c in enumerate(row)), "</tr>"]
         self.parts.append("".join([*out, "</table></div>"]))
 
-    def pictures(self, pictures: Iterable[Picture]) -> None:
+    def pictures(self, pictures: Iterable[PagePicture]) -> None:
         """Add pictures with their captions."""
         for picture in pictures:
             data = base64.b64encode(picture.png).decode()

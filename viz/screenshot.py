@@ -19,7 +19,7 @@ SETTLE_S = 1.5
 
 
 @dataclass(frozen=True)
-class Picture:
+class Screenshot:
     """A picture of the viewer, and what its views complained of.
 
     Attributes
@@ -44,7 +44,7 @@ def screenshots(
     at: float = 1.0,
     size: tuple[int, int] = (1600, 900),
     patience_s: float = PATIENCE_S,
-) -> list[Picture]:
+) -> list[Screenshot]:
     """Open a ``.rrd`` in a viewer without a window and take a picture of each tab.
 
     Parameters
@@ -89,7 +89,7 @@ def screenshots(
             reports = tuple(
                 f"{v.name}: {r.severity}: {r.summary}" for v in client.get_state().views for r in v.reports
             )
-            pictures.append(Picture(tab, png, reports))
+            pictures.append(Screenshot(tab, png, reports))
         return pictures
 
 

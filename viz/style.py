@@ -30,7 +30,7 @@ DEGREES = 57.29577951308232
 """Degrees a radian."""
 
 
-class Column(NamedTuple):
+class ColumnStyle(NamedTuple):
     """How a column is shown: a short name with its unit, and the factor from SI to that unit."""
 
     name: str
@@ -38,27 +38,27 @@ class Column(NamedTuple):
 
 
 COLUMNS = {
-    **{f"acc_{a}": Column(f"acceleration {a} (m/s²)") for a in "xyz"},
-    **{f"gyr_{a}": Column(f"angular rate {a} (rad/s)") for a in "xyz"},
-    **{f"mag_{a}": Column(f"magnetic field {a} (µT)", 1e6) for a in "xyz"},
-    **{f"pos_{a}": Column(f"position {a} (m)") for a in "xyz"},
-    **{f"vel_{a}": Column(f"velocity {a} (m/s)") for a in "xyz"},
-    **{f"sigma_pos_{a}": Column(f"position {a} (m)") for a in "xyz"},
-    **{f"sigma_vel_{a}": Column(f"velocity {a} (m/s)") for a in "xyz"},
-    **{f"sigma_att_{a}": Column(f"attitude {a} (°)", DEGREES) for a in "xyz"},
-    "acc_norm": Column("‖acc‖ (m/s²)"),
-    "acc_var": Column("variance of ‖acc‖ (m²/s⁴)"),
-    "gyr_norm": Column("‖gyr‖ (rad/s)"),
-    "pitch_dev": Column("pitch − pitch at rest (°)"),
-    "pitch_var": Column("variance of pitch (°²)"),
-    "shoe": Column("SHOE (–)"),
-    "are": Column("angular rate energy (rad²/s²)"),
-    "mv": Column("moving variance (m²/s⁴)"),
-    "mag": Column("magnitude deviation (m²/s⁴)"),
-    "pressure_pa": Column("pressure (hPa)", 0.01),
-    "temperature_c": Column("temperature (°C)"),
-    "height_m": Column("height (m)"),
-    "length_m": Column("length (m)"),
+    **{f"acc_{a}": ColumnStyle(f"acceleration {a} (m/s²)") for a in "xyz"},
+    **{f"gyr_{a}": ColumnStyle(f"angular rate {a} (rad/s)") for a in "xyz"},
+    **{f"mag_{a}": ColumnStyle(f"magnetic field {a} (µT)", 1e6) for a in "xyz"},
+    **{f"pos_{a}": ColumnStyle(f"position {a} (m)") for a in "xyz"},
+    **{f"vel_{a}": ColumnStyle(f"velocity {a} (m/s)") for a in "xyz"},
+    **{f"sigma_pos_{a}": ColumnStyle(f"position {a} (m)") for a in "xyz"},
+    **{f"sigma_vel_{a}": ColumnStyle(f"velocity {a} (m/s)") for a in "xyz"},
+    **{f"sigma_att_{a}": ColumnStyle(f"attitude {a} (°)", DEGREES) for a in "xyz"},
+    "acc_norm": ColumnStyle("‖acc‖ (m/s²)"),
+    "acc_var": ColumnStyle("variance of ‖acc‖ (m²/s⁴)"),
+    "gyr_norm": ColumnStyle("‖gyr‖ (rad/s)"),
+    "pitch_dev": ColumnStyle("pitch − pitch at rest (°)"),
+    "pitch_var": ColumnStyle("variance of pitch (°²)"),
+    "shoe": ColumnStyle("SHOE (–)"),
+    "are": ColumnStyle("angular rate energy (rad²/s²)"),
+    "mv": ColumnStyle("moving variance (m²/s⁴)"),
+    "mag": ColumnStyle("magnitude deviation (m²/s⁴)"),
+    "pressure_pa": ColumnStyle("pressure (hPa)", 0.01),
+    "temperature_c": ColumnStyle("temperature (°C)"),
+    "height_m": ColumnStyle("height (m)"),
+    "length_m": ColumnStyle("length (m)"),
 }
 """Columns with a name of their own; others are shown as ``column (unit)`` of their schema."""
 

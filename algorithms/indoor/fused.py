@@ -20,7 +20,7 @@ from .steps import make_state
 from .trilateration import POSITION, RANGES, SIGMA
 
 
-class FusedParams(msgspec.Struct, frozen=True, kw_only=True):
+class IndoorFusedParams(msgspec.Struct, frozen=True, kw_only=True):
     """Parameters of the particle filter."""
 
     particles: Annotated[int, meta("number of particles", "", "", ge=10)] = 1000
@@ -89,7 +89,7 @@ class IndoorFused(KernelEstimator):
     name: ClassVar[str] = "indoor.fused"
     title: ClassVar[str] = "each signal strength as it comes, steps, walls and radio map: particle filter"
     source: ClassVar[str] = "Doucet et al. 2000 (Rao–Blackwellised particles); Gudmundson 1991 (shadowing)"
-    Params: ClassVar[type[msgspec.Struct]] = FusedParams
+    Params: ClassVar[type[msgspec.Struct]] = IndoorFusedParams
     presets: ClassVar = {"no-map": {"use_map": False}}
     inputs = (
         Input("radio", "marcha_msgs/msg/RadioSignal", ("mac", "rssi_dbm"), optional=True, many=True),
@@ -106,7 +106,7 @@ class IndoorFused(KernelEstimator):
         """Lay out anchors, map and plan, and scatter the particles."""
         super().start(context)
         p = self.params
-        self.said: list[Remark] = []
+        self.start_remarks: list[Remark] = []
         heard = context.has("radio") or context.has("ranges")
         stepped = context.has("steps") or (context.has("imu") and context.has("orientation"))
         raster = raster_of(context) if p.walls else None
@@ -117,7 +117,7 @@ class IndoorFused(KernelEstimator):
                 raise
             none = np.zeros(0)
             anchors = Anchors([], [], np.zeros((0, 3)), none, none, none)
-            self.said.append(
+            self.start_remarks.append(
                 Remark("no_anchors", "no anchor positions: steps and walls from the known start only")
             )
         if not heard and not (stepped and p.known_start):
@@ -150,7 +150,7 @@ class IndoorFused(KernelEstimator):
             cell, cells = 0.0, np.ones((1, 1), np.uint8)
         x_axis, mirrored, known = plan_frame(context, p.x_axis_azimuth_deg)
         if stepped and not context.has("steps") and not known and p.heading_sd_deg < 90:
-            self.said.append(
+            self.start_remarks.append(
                 Remark(
                     "plan_north", "the plan does not say where north is: its x axis is taken to point north"
                 )
@@ -231,13 +231,13 @@ class IndoorFused(KernelEstimator):
     def remarks(self) -> list[Remark]:
         """Say what a user must know of the run."""
         s = self.state.s[0]
-        said = [*self.said, *self.anchors.remarks]
+        remarks = [*self.start_remarks, *self.anchors.remarks]
         if s["received"] == 0 and s["steps"] == 0:
-            said.append(
+            remarks.append(
                 Remark(
                     "nothing_heard",
                     "no power of a known anchor and no step: no position; check anchors.csv",
                     True,
                 )
             )
-        return said
+        return remarks

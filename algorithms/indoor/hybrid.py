@@ -12,7 +12,7 @@ import numpy as np
 from ..contract import Context, Message, PlainEstimator, Remark, Result
 from ..parameters import meta
 from .anchors import anchors_of
-from .pdr import IMU, MAG, ORIENTATION, STEP, StepParams, Steps
+from .pdr import IMU, MAG, ORIENTATION, STEP, IndoorStepParams, SourceSteps
 from .trilateration import POSITION, RADIO, RANGED, SIGMA, ranging_results
 from .windows import SOURCE, RangingParams, Windows
 
@@ -36,8 +36,8 @@ class FusionParams(RangingParams, frozen=True, kw_only=True):
 HybridParams = msgspec.defstruct(
     "HybridParams",
     [
-        (name, kind, getattr(StepParams(), name))
-        for name, kind in get_type_hints(StepParams, include_extras=True).items()
+        (name, kind, getattr(IndoorStepParams(), name))
+        for name, kind in get_type_hints(IndoorStepParams, include_extras=True).items()
     ],
     bases=(FusionParams,),
     frozen=True,
@@ -70,7 +70,7 @@ class IndoorHybrid(PlainEstimator):
         """Find the anchors and the plan's frame."""
         p = self.params
         self.windows = Windows(p, anchors_of(context, without=p.without))
-        self.steps = Steps(p, context)
+        self.steps = SourceSteps(p, context)
         self.at = np.array([p.start_x, p.start_y]) if p.known_start else np.full(2, np.nan)
         self.variance = p.p0
         self.fixes = 0
@@ -117,7 +117,7 @@ class IndoorHybrid(PlainEstimator):
 
     def remarks(self) -> list[Remark]:
         """Say what a user must know of the run."""
-        said = self.windows.remarks()
+        remarks = self.windows.remarks()
         if self.fixes == 0 and self.params.known_start:  # dead reckoning alone, which is still a track
-            said = [Remark(r.kind, f"{r.detail}; dead reckoning only", False) for r in said]
-        return said + self.steps.remarks()
+            remarks = [Remark(r.kind, f"{r.detail}; dead reckoning only", False) for r in remarks]
+        return remarks + self.steps.remarks()

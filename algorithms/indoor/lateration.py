@@ -111,7 +111,7 @@ def corrected(anchors: ArrayLike, ranges: ArrayLike, correction: Correction = "v
 
 
 @dataclass(frozen=True)
-class Fix:
+class PositionFix:
     """A position with its uncertainty.
 
     Attributes
@@ -137,7 +137,7 @@ def least_squares(
     heights: ArrayLike | None = None,
     margin_m: float = 10.0,
     steps: int = 30,
-) -> Fix | None:
+) -> PositionFix | None:
     """Return the weighted nonlinear least-squares position of all anchors; None where there is none.
 
     The residual is that of the logarithm of the range, in which errors of received power are additive:
@@ -194,7 +194,7 @@ def least_squares(
         return None
     freedom = d.size - 2
     chi2 = best / freedom if freedom > 0 else math.nan
-    return Fix(p, np.asarray(np.linalg.inv(normal), dtype=np.float64), chi2)
+    return PositionFix(p, np.asarray(np.linalg.inv(normal), dtype=np.float64), chi2)
 
 
 def information(

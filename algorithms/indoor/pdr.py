@@ -27,7 +27,7 @@ STEP_COLUMNS = ("start_ns", "end_ns", "index", "length_m", "height_m", "heading_
 STEP = Output("step", "marcha_msgs/msg/Step", STEP_COLUMNS, event=True)
 
 
-class StepParams(msgspec.Struct, frozen=True, kw_only=True):
+class IndoorStepParams(msgspec.Struct, frozen=True, kw_only=True):
     """Parameters of the source's steps and headings."""
 
     threshold: Annotated[
@@ -72,7 +72,7 @@ def plan_frame(context: Context, x_axis_azimuth_deg: float) -> tuple[float, bool
     return math.radians(azimuth), mirrored, stated is not None or x_axis_azimuth_deg != 0
 
 
-class Steps:
+class SourceSteps:
     """The step detector with a heading beside it, one message at a time."""
 
     def __init__(self, params: Any, context: Context) -> None:
@@ -120,9 +120,9 @@ class Steps:
 
     def remarks(self) -> list[Remark]:
         """Say what a user must know of steps and headings."""
-        said = []
+        remarks = []
         if not self.north:
-            said.append(
+            remarks.append(
                 Remark(
                     "plan_north",
                     "the plan does not say where north is: its x axis is taken to point north; state "
@@ -130,14 +130,14 @@ class Steps:
                 )
             )
         if self.unknown:
-            said.append(
+            remarks.append(
                 Remark(
                     "no_heading",
                     f"{self.unknown} steps before any orientation or magnetic field: left out",
                     self.state[0]["index"] == 0,
                 )
             )
-        return said
+        return remarks
 
 
 class IndoorPdr(PlainEstimator):
@@ -146,7 +146,7 @@ class IndoorPdr(PlainEstimator):
     name: ClassVar[str] = "indoor.pdr"
     title: ClassVar[str] = "the source's dead reckoning: threshold steps of 0.7 m along the azimuth"
     source: ClassVar[str] = "hybrid indoor positioning, sections 3.4 and 4.5, eqs 3.22–3.26"
-    Params: ClassVar[type[msgspec.Struct]] = StepParams
+    Params: ClassVar[type[msgspec.Struct]] = IndoorStepParams
     inputs = (IMU, ORIENTATION, MAG)
     outputs = (
         Output(
@@ -163,7 +163,7 @@ class IndoorPdr(PlainEstimator):
             raise AlgorithmError(
                 f"{self.name} needs an orientation or a magnetometer beside the accelerometer for its heading"
             )
-        self.steps = Steps(self.params, context)
+        self.steps = SourceSteps(self.params, context)
         self.x, self.y = self.params.start_x, self.params.start_y
 
     def take(self, message: Message) -> Iterable[Result]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..contract import AlgorithmError, Context, Input, Message, Output, PlainEstimator, Remark, Result
 from .anchors import anchors_of
-from .windows import Ranges, RangingParams, Windows
+from .windows import RangingParams, WindowRanges, Windows
 
 RADIO = Input("radio", "marcha_msgs/msg/RadioSignal", ("mac", "rssi_dbm"), many=True)
 RANGES = Input("ranges", "marcha_msgs/msg/Ranging", ("mac", "distance_m"), optional=True, many=True)
@@ -54,7 +54,7 @@ class IndoorTrilateration(PlainEstimator):
             self.windows.distance(mac, value)
         return results
 
-    def answer(self, ranges: Ranges) -> list[Result]:
+    def answer(self, ranges: WindowRanges) -> list[Result]:
         """Return the results of a window."""
         results = list(ranging_results(self.windows, ranges))
         fix = self.windows.fix(ranges)
@@ -70,7 +70,7 @@ class IndoorTrilateration(PlainEstimator):
         return self.windows.remarks()
 
 
-def ranging_results(windows: Windows, ranges: Ranges) -> Iterable[Result]:
+def ranging_results(windows: Windows, ranges: WindowRanges) -> Iterable[Result]:
     """Yield the ranges of a window before and after the correction."""
     a = windows.anchors
     for i, k in enumerate(ranges.anchors.tolist()):

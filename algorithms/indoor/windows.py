@@ -47,7 +47,7 @@ class RangingParams(msgspec.Struct, frozen=True, kw_only=True):
 
 
 @dataclass
-class Ranges:
+class WindowRanges:
     """Ranges of a window.
 
     Attributes
@@ -84,7 +84,7 @@ class Windows:
     counts: dict[str, int] = field(default_factory=dict)
     unknown: dict[str, int] = field(default_factory=dict)
 
-    def close(self, t_ns: int) -> Ranges | None:
+    def close(self, t_ns: int) -> WindowRanges | None:
         """Return the ranges of the window that ``t_ns`` is beyond, None where there is none to close."""
         length = round(self.params.window_s * 1e9)
         if self.start_ns is None:
@@ -95,7 +95,7 @@ class Windows:
         self.start_ns += (t_ns - self.start_ns) // length * length
         return self.ranges(end)
 
-    def ranges(self, end_ns: int) -> Ranges:
+    def ranges(self, end_ns: int) -> WindowRanges:
         """Return the ranges of what was collected, and forget it."""
         p, a = self.params, self.anchors
         heard = sorted(set(self.powers) | set(self.distances))
@@ -114,7 +114,7 @@ class Windows:
             numbers, slope, sigma = numbers[near], slope[near], sigma[near]
         plane = plane_range_m(slope, a.above(p.height_m)[numbers])
         better = corrected(a.plane[numbers], plane, p.correction) if numbers.size else plane
-        return Ranges(end_ns, numbers, slope, plane, better, sigma)
+        return WindowRanges(end_ns, numbers, slope, plane, better, sigma)
 
     def power(self, mac: str, rssi_dbm: float) -> None:
         """Add a power; those of unknown anchors are counted."""
@@ -134,7 +134,7 @@ class Windows:
         elif np.isfinite(metres) and metres >= 0:
             self.distances.setdefault(number, []).append(metres)
 
-    def fix(self, ranges: Ranges) -> tuple[FloatArray, FloatArray] | None:
+    def fix(self, ranges: WindowRanges) -> tuple[FloatArray, FloatArray] | None:
         """Return position (2,) and covariance (2, 2), None where the anchors do not do; the reason is counted."""
         p, where = self.params, self.anchors.plane[ranges.anchors]
         if ranges.anchors.size < p.least_anchors:
@@ -157,27 +157,29 @@ class Windows:
 
     def remarks(self) -> list[Remark]:
         """Return what a user must know of the windows so far."""
-        said = list(self.anchors.remarks)
+        remarks = list(self.anchors.remarks)
         got = self.counts.get("fixes", 0)
         for kind, name, remedy in (
             ("too_few_anchors", "too few anchors", "add anchors, lengthen window_s or raise reach_m"),
             ("collinear_anchors", "anchors on a line", "add an anchor beside the line"),
         ):
             if count := self.counts.get(name, 0):
-                said.append(
+                remarks.append(
                     Remark(kind, f"{name} in {count} of {count + got} windows: no fix; {remedy}", got == 0)
                 )
         if self.unknown:
             some = ", ".join(list(self.unknown)[:3])
-            said.append(
+            remarks.append(
                 Remark(
                     "unknown_anchor",
                     f"{len(self.unknown)} addresses are in no anchor table: {some}; left out",
                 )
             )
         if count := self.counts.get("left out", 0):
-            said.append(Remark("bad_power", f"{count} powers are not negative dBm above the least; left out"))
-        return said
+            remarks.append(
+                Remark("bad_power", f"{count} powers are not negative dBm above the least; left out")
+            )
+        return remarks
 
 
 CORRECTIONS: tuple[Correction, ...] = ("none", "votes", "both")

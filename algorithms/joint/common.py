@@ -189,9 +189,9 @@ class JointEstimator(KernelEstimator):
         s["lookahead"] = self.lookahead
         s["seen"] = merge.NEVER
         s["newest"] = merge.NEVER
-        self.lay(context)
+        self.set_up(context)
 
-    def lay(self, context: Context) -> None:
+    def set_up(self, context: Context) -> None:
         """Write parameters into the state and set ``outputs``."""
 
     def encode(self, index: int, channel: int, table: pl.DataFrame) -> FloatArray:

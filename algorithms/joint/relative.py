@@ -10,7 +10,7 @@ from ..contract import AlgorithmError, Context, FloatArray, Input, Output, Remar
 from ..parameters import meta
 from . import chain
 from .common import JointEstimator, MergeParams, encoder, imu, mounts
-from .source import JOINT_STATE, NAMED, axis_remarks, lay_axes
+from .source import JOINT_STATE, NAMED, axis_remarks, set_up_axes
 
 QUATERNION = "geometry_msgs/msg/QuaternionStamped"
 QUAT = ("quat_w", "quat_x", "quat_y", "quat_z")
@@ -109,7 +109,7 @@ class ChainEstimator(JointEstimator):
     run = staticmethod(chain.run)
     run_end = staticmethod(chain.run_end)
 
-    def lay(self, context: Context) -> None:
+    def set_up(self, context: Context) -> None:
         """Write parameters into the state and set ``outputs``."""
         s, p, n = self.state[0], self.params, len(self.segments)
         s["gravity"] = p.gravity
@@ -130,10 +130,10 @@ class ChainEstimator(JointEstimator):
         s["learn"], s["known"] = 0, 1
         for j in range(n - 1):
             s["j"][j] = s["mount"][j : j + 2, 0]
-        self.lay_joints(context)
+        self.set_up_joints(context)
         self.outputs = self.outputs_of()
 
-    def lay_joints(self, context: Context) -> None:
+    def set_up_joints(self, context: Context) -> None:
         """Write what is known of the joints."""
 
     def outputs_of(self) -> tuple[Output, ...]:
@@ -179,10 +179,10 @@ class JointHinge(ChainEstimator):
     Params = HingeParams
     inputs: tuple[Input, ...] = (imu("thigh"), imu("shank"), encoder(True))
 
-    def lay_joints(self, context: Context) -> None:
+    def set_up_joints(self, context: Context) -> None:
         """Write axes and the identification's settings."""
         s, p = self.state[0], self.params
-        lay_axes(s, p, self.segments, context, p.misfit_gyr, p.misfit_acc)
+        set_up_axes(s, p, self.segments, context, p.misfit_gyr, p.misfit_acc)
         s["type"] = chain.HINGE
         s["j"][0] = s["axis"]
         s["lever"][0] = s["pos"]
@@ -214,7 +214,7 @@ class JointRelative(ChainEstimator):
         encoder(True),
     )
 
-    def lay_joints(self, context: Context) -> None:
+    def set_up_joints(self, context: Context) -> None:
         """Write kinds, axes and positions of the joints."""
         s, p = self.state[0], self.params
         calibration = context.calibrations.get("joint")

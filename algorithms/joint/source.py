@@ -155,7 +155,7 @@ class SourceFilter(JointEstimator):
     run = staticmethod(linear.run)
     run_end = staticmethod(linear.run_end)
 
-    def lay(self, context: Context) -> None:
+    def set_up(self, context: Context) -> None:
         """Write parameters into the state and set ``outputs``."""
         s, p, n = self.state[0], self.params, len(self.segments)
         s["kind"], s["axes"] = self.kind, self.axes
@@ -340,9 +340,9 @@ class JointSmea(SourceFilter):
     least = 2
     inputs: tuple[Input, ...] = (imu("thigh"), imu("shank"))
 
-    def lay(self, context: Context) -> None:
+    def set_up(self, context: Context) -> None:
         """Write the parameters of the self-aligned angle."""
-        super().lay(context)
+        super().set_up(context)
         s, p = self.state[0], self.params
         s["r_self"] = p.sigma2_joint, p.sigma2_joint
         s["alpha_seel"] = p.fusion == "seel"
@@ -350,14 +350,14 @@ class JointSmea(SourceFilter):
         s["alpha_r"] = p.sigma2_alpha
         s["alpha_q"] = p.sigma2_gyr, p.sigma2_bias
         s["alpha_decay"] = 1.0 / p.tau_s
-        lay_axes(s, p, self.segments, context, p.sd_gyr, p.sd_acc)
+        set_up_axes(s, p, self.segments, context, p.sd_gyr, p.sd_acc)
 
     def remarks(self) -> list[Remark]:
         """Say whether the axes are known."""
         return super().remarks() + axis_remarks(self.state[0], self.segments)
 
 
-def lay_axes(
+def set_up_axes(
     s: Any, p: Any, segments: tuple[str, ...], context: Context, sd_gyr: float, sd_acc: float
 ) -> None:
     """Write axes, positions and the identification's settings into a packed state with its mountings laid."""

@@ -13,7 +13,7 @@ from ..contract import AlgorithmError, FloatArray
 
 
 @dataclass(frozen=True)
-class Transform:
+class Similarity:
     """``global = scale · rotation @ local + shift``.
 
     Attributes
@@ -40,7 +40,7 @@ class Transform:
 
 def horn(
     local: FloatArray, target: FloatArray, *, scale: bool = True, weights: FloatArray | None = None
-) -> Transform:
+) -> Similarity:
     """Return the transform that takes ``local`` to ``target`` with the least squared distances.
 
     In the plane ``sR = Σ g' conj(l') / Σ |l'|²`` with the points as complex numbers about their centroids; in
@@ -88,7 +88,7 @@ def horn(
     k = factor if scale else 1.0
     shift = cb - k * rotation @ ca
     left = b - (k * a @ rotation.T + shift)
-    return Transform(rotation, float(k), shift, float(np.sqrt(w @ (left * left).sum(axis=1))))
+    return Similarity(rotation, float(k), shift, float(np.sqrt(w @ (left * left).sum(axis=1))))
 
 
 def _rotation_of(m: FloatArray) -> FloatArray:

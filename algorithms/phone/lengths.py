@@ -11,7 +11,7 @@ from ..contract import AlgorithmError, FloatArray
 from ..numerics.compiled import compiled
 from ..parameters import meta
 from .ring import F_MAX, F_MAX_LOW, F_MEAN, F_MEAN_ABS, F_MIN, F_MIN_LOW, F_PERIOD, F_VAR
-from .steps import StepParams
+from .steps import PhoneStepParams
 
 MODELS = ("cadence", "static", "linear", "weinberg", "kim", "scarlett", "equal")
 CADENCE, STATIC, LINEAR, WEINBERG, KIM, SCARLETT, EQUAL = range(len(MODELS))
@@ -24,7 +24,7 @@ FIELDS: list[tuple[Any, ...]] = [
 ]
 
 
-class LengthParams(StepParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class LengthParams(PhoneStepParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Detector of steps, and which model of their length."""
 
     length: Annotated[

@@ -123,7 +123,7 @@ class PdrParams(LengthParams, frozen=True, forbid_unknown_fields=True, kw_only=T
     ] = 0.0
 
 
-class FusedParams(PdrParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class PhoneFusedParams(PdrParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What fixes are worth, beside steps, lengths and headings."""
 
     gnss_sd_m: Annotated[
@@ -358,7 +358,7 @@ class PhoneFused(PhoneTrack):
     name: ClassVar[str] = "phone.fused"
     title: ClassVar[str] = "steps, heading and GNSS fixes fused, causal"
     source: ClassVar[str] = "ours; data association: Bar-Shalom et al. 2009"
-    Params = FusedParams
+    Params = PhoneFusedParams
     inputs = (GYR, ACC, MAG, PRESSURE, GNSS)
     outputs = (STEP, POSE, SIGMA, HEADING, DETECTOR, FIX, STATE)
     fused: ClassVar[bool] = True

@@ -11,14 +11,14 @@ import numpy as np
 from ..contract import ALL_COLUMNS, Context, FloatArray, IntArray, Message, PlainEstimator, Remark, Result
 from ..numerics.compiled import compiled
 from . import geodesy
-from .pdr import FIX, POSE, SIGMA, FusedParams, PhoneFused
+from .pdr import FIX, POSE, SIGMA, PhoneFused, PhoneFusedParams
 from .steps import STEP
 
 N = 7
 """East, north, heading correction, log scale, slow error of fixes (2), drift; as in :mod:`.mixture`."""
 
 
-class Walk(NamedTuple):
+class WalkEvents(NamedTuple):
     """Steps and fixes of a walk in the order of time.
 
     Attributes
@@ -44,16 +44,16 @@ class Smoothed(NamedTuple):
     inlier: FloatArray
 
 
-def smooth(walk: Walk, heading0: float, p: FusedParams, rounds: int = 8) -> Smoothed:
+def smooth(walk: WalkEvents, heading0: float, p: PhoneFusedParams, rounds: int = 8) -> Smoothed:
     """Return the most probable track: Gauss–Newton as iterated linear smoothers, outliers by reweighting.
 
     Parameters
     ----------
-    walk : Walk
+    walk : WalkEvents
         Steps and fixes.
     heading0 : float
         Heading correction to begin with (rad); should be right within 60°.
-    p : FusedParams
+    p : PhoneFusedParams
         Standard deviations.
     rounds : int
         Rounds of linearization at most; it ends when no position moves by more than 1 cm.
@@ -90,7 +90,7 @@ def smooth(walk: Walk, heading0: float, p: FusedParams, rounds: int = 8) -> Smoo
 
 
 def _pass(
-    walk: Walk, dt: FloatArray, ref: FloatArray, inlier: FloatArray, p: FusedParams
+    walk: WalkEvents, dt: FloatArray, ref: FloatArray, inlier: FloatArray, p: PhoneFusedParams
 ) -> tuple[FloatArray, FloatArray]:
     """Return one linear smoother about ``ref``."""
     n = len(dt)
@@ -126,7 +126,7 @@ def _pass(
 
 
 def _model(
-    move: FloatArray, dt: float, at: FloatArray, slow: float, p: FusedParams
+    move: FloatArray, dt: float, at: FloatArray, slow: float, p: PhoneFusedParams
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return Jacobian, noise and value of the motion to the next event, linearized at ``at``."""
     F, Q = np.eye(N), np.zeros((N, N))
@@ -153,7 +153,9 @@ def _model(
     return F, Q, value
 
 
-def _inliers(walk: Walk, state: FloatArray, cov: FloatArray, used: FloatArray, p: FusedParams) -> FloatArray:
+def _inliers(
+    walk: WalkEvents, state: FloatArray, cov: FloatArray, used: FloatArray, p: PhoneFusedParams
+) -> FloatArray:
     """Return each fix's probability of being one, from its residual against the smoothed track without it."""
     out = np.zeros(len(state))
     for k in np.flatnonzero(np.isfinite(walk.fix[:, 0])):
@@ -197,7 +199,7 @@ class PhoneSmooth(PlainEstimator):
     title: ClassVar[str] = "steps, heading and all GNSS fixes at once, offline"
     source: ClassVar[str] = "ours; Rauch, Tung and Striebel 1965, Bell 1994"
     offline: ClassVar[bool] = True
-    Params = FusedParams
+    Params = PhoneFusedParams
     inputs = PhoneFused.inputs
     outputs = (STEP, POSE, SIGMA, FIX)
 
@@ -255,9 +257,9 @@ class PhoneSmooth(PlainEstimator):
         forward, out = self._forward, {o.name: [] for o in self._forward.outputs}
         for a in range(0, len(times), 512):
             b = min(a + 512, len(times))
-            room = (b - a) * forward.max_results
-            whose, when = np.zeros(room, np.int64), np.zeros(room, np.int64)
-            rows = np.full((room, forward.width), np.nan)
+            capacity = (b - a) * forward.max_results
+            whose, when = np.zeros(capacity, np.int64), np.zeros(capacity, np.int64)
+            rows = np.full((capacity, forward.width), np.nan)
             n = forward.run(
                 forward.state, index[a:b], index[a:b] * 0, times[a:b], values[a:b], whose, when, rows
             )
@@ -296,7 +298,7 @@ class PhoneSmooth(PlainEstimator):
         seen[np.searchsorted(t_ns, fix_times)] = np.column_stack((place, sd))
         settled = [c[0] for _, _, c in steps[len(steps) // 2 :]] or [0.0]
         drift = math.atan2(np.mean(np.sin(settled)), np.mean(np.cos(settled)))
-        done = smooth(Walk(t_ns, walked, seen), drift, p)
+        done = smooth(WalkEvents(t_ns, walked, seen), drift, p)
         if not np.isfinite(done.state).all():
             self._failed = "the smoother diverged"
             return []

@@ -14,7 +14,7 @@ from ..parameters import meta
 from . import attitude, direction, lengths, ring, steps
 from .lengths import LengthParams
 from .pdr import GYR, MAG, POSE, SourceParams, calibrated_field
-from .steps import ACC, StepParams
+from .steps import ACC
 
 STEP_COLUMNS = ("start_ns", "end_ns", "index", "length_m", "height_m", "heading_rad")
 STEPS = Output("step", "marcha_msgs/msg/Step", STEP_COLUMNS, event=True)
@@ -270,4 +270,4 @@ class PhoneSum(PlainEstimator):
         return [Result("pose", message.t_ns, (*self.place, *quat))]
 
 
-__all__ = ["PhoneAttitude", "PhoneHeading", "PhoneLength", "PhoneSum", "StepParams"]
+__all__ = ["PhoneAttitude", "PhoneHeading", "PhoneLength", "PhoneSum"]

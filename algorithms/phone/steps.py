@@ -29,7 +29,7 @@ AT_ONCE = 12
 _YANG = "Yang et al. 2014, phone dissertation, section 3.1.2"
 
 
-class StepParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class PhoneStepParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Which detector of steps, and its constants."""
 
     rate_hz: Annotated[
@@ -122,7 +122,7 @@ FIELDS: list[tuple[Any, ...]] = [
 _CELLS = {"best": cells.RHYTHM, "autocorrelation": cells.AUTOCORRELATION, "spectral": cells.SPECTRAL}
 
 
-def configure(s: Any, p: StepParams, rate_hz: float) -> None:
+def configure(s: Any, p: PhoneStepParams, rate_hz: float) -> None:
     """Write the detector and its constants into record ``s``."""
     half = round(p.window_s * rate_hz)
     if half > surveyed.MAX_HALF:
@@ -225,7 +225,7 @@ class PhoneSteps(KernelEstimator):
     name: ClassVar[str] = "phone.steps"
     title: ClassVar[str] = "steps of a phone's carrier from the accelerometer"
     source: ClassVar[str] = "phone dissertation, section 3.1.2; best: ours"
-    Params = StepParams
+    Params = PhoneStepParams
     inputs = (ACC,)
     outputs = (STEP, DETECTOR)
     run = staticmethod(run)

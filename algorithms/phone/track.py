@@ -251,10 +251,10 @@ def drain(
     out_t_ns: Any,
     out: Any,
     count: int,
-    room: int,
+    capacity: int,
 ) -> int:
     """Process what is known by now, in the order of its times."""
-    while room > 0:
+    while capacity > 0:
         if s.queued > 0:
             if s.part_on == 0:
                 _open_step(s)
@@ -271,7 +271,7 @@ def drain(
                 else:
                     s.part = 1.0 - 1e-9
                     continue
-                count, room = count + 1, room - 1
+                count, capacity = count + 1, capacity - 1
                 continue
         elif s.waiting > 0:
             # No step is known yet that could cover the fix.
@@ -283,7 +283,7 @@ def drain(
         t = s.wait_ns[0]
         _use_fix(s, t)
         _write_track(s, t, at, out_message, out_t_ns, out, count)
-        count, room = count + 1, room - 1
+        count, capacity = count + 1, capacity - 1
     return count
 
 

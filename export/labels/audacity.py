@@ -19,12 +19,12 @@ UNIT = 1000
 
 def limits(rows: pl.DataFrame) -> list[str]:
     """Return what the format cannot hold of these annotations."""
-    said = ["times are rounded to 1 µs; id, source, confidence, note, channel and metadata have no place"]
+    losses = ["times are rounded to 1 µs; id, source, confidence, note, channel and metadata have no place"]
     if rows["tier"].n_unique() > 1:
-        said.append("one track holds all tiers: the tier stands in brackets before the text")
+        losses.append("one track holds all tiers: the tier stands in brackets before the text")
     if rows["label"].str.contains(r"[\x00-\x1f\x{85}\x{2028}\x{2029}]").any():
-        said.append("line breaks and tabs in labels are written as signs")
-    return said
+        losses.append("line breaks and tabs in labels are written as signs")
+    return losses
 
 
 def labels(rows: pl.DataFrame, origin_ns: int) -> list[Label]:

@@ -25,15 +25,15 @@ _NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 def limits(rows: pl.DataFrame) -> list[str]:
     """Return what the format cannot hold of these annotations."""
-    said = [
+    losses = [
         "times are cut to whole ms; id, confidence, note, channel and metadata have no place, and the source "
         "is one a tier"
     ]
     if (rows["start_ns"] == rows["end_ns"]).any():
-        said.append("instants last 1 ms")
+        losses.append("instants last 1 ms")
     if any(_lanes(rows, 0)):
-        said.append("labels of a tier may not overlap: they are moved to numbered tiers")
-    return said
+        losses.append("labels of a tier may not overlap: they are moved to numbered tiers")
+    return losses
 
 
 def _times(rows: pl.DataFrame, origin_ns: int) -> list[tuple[str, int, int]]:

@@ -17,15 +17,15 @@ suffix = ".TextGrid"
 
 def limits(rows: pl.DataFrame) -> list[str]:
     """Return what the format cannot hold of these annotations."""
-    said = ["id, source, confidence, note, channel and metadata have no place"]
+    losses = ["id, source, confidence, note, channel and metadata have no place"]
     if any(lane for _, lane in _lanes(rows)):
-        said.append("labels of a tier may not overlap: they are moved to numbered tiers")
+        losses.append("labels of a tier may not overlap: they are moved to numbered tiers")
     kinds = rows.group_by("tier").agg((pl.col("start_ns") == pl.col("end_ns")).n_unique())
     if (kinds[kinds.columns[1]] > 1).any():
-        said.append("a tier holds intervals or points: tiers with both are split")
+        losses.append("a tier holds intervals or points: tiers with both are split")
     if (rows["label"] == "").any():
-        said.append("an interval without text is space between labels")
-    return said
+        losses.append("an interval without text is space between labels")
+    return losses
 
 
 def _lanes(rows: pl.DataFrame) -> list[tuple[bool, int]]:
@@ -196,11 +196,11 @@ def _read_tier(path: Path, tokens: _Tokens) -> list[Label]:
     tokens.time("xmax")
     out = []
     for _ in range(tokens.count("labels")):
-        start, said = tokens.time("a time")
-        end, until = tokens.time("a time") if kind == "IntervalTier" else (start, said)
+        start, stated = tokens.time("a time")
+        end, until = tokens.time("a time") if kind == "IntervalTier" else (start, stated)
         if end < start:
             raise MarchaError(
-                f"{path}: line {tokens.line}: tier {tier[:40]!r}: ends at {until}, before {said}"
+                f"{path}: line {tokens.line}: tier {tier[:40]!r}: ends at {until}, before {stated}"
             )
         text = tokens.string("a text")
         out.append(Label(tier, start, end, text, filler=kind == "IntervalTier" and not text.strip()))

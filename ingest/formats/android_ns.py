@@ -27,8 +27,8 @@ from ..phonelog import (
     MAG,
     MICROTESLA,
     STEP,
-    Part,
     Stream,
+    StreamChannel,
     declared,
     imu_part,
     require_rows,
@@ -81,7 +81,7 @@ class AndroidNs:
         for file in files:
             kind = _kind(start_of(file))
             if kind == "contact":
-                part = Part(
+                part = StreamChannel(
                     "/reference/steps", STEP, _step, frame_id="feet", metadata={"source": "foot contacts"}
                 )
                 streams.append((file, CONTACT, Stream([part], report, subject=file.name, events=True)))
@@ -122,15 +122,15 @@ def _kind(head: bytes) -> str:
     return "contact" if all(_CONTACT.fullmatch(r) for r in rows) else ""
 
 
-def _part(file: Path, sensor: str | None) -> Part:
-    said = sensor or next((s for key, s in _SENSORS.items() if file.stem.lower().startswith(key)), None)
-    if said is None:
+def _part(file: Path, sensor: str | None) -> StreamChannel:
+    kind = sensor or next((s for key, s in _SENSORS.items() if file.stem.lower().startswith(key)), None)
+    if kind is None:
         raise MarchaError(
             f"{file}: neither name nor content says which sensor this is; give --set sensor=acc, gyr or mag"
         )
-    if said == "mag":
-        return Part("/phone/mag", MAG, xyz(FIELD, "xyz", MICROTESLA))
-    return imu_part(f"/phone/{said}", xyz(ACC if said == "acc" else GYR, "xyz"))
+    if kind == "mag":
+        return StreamChannel("/phone/mag", MAG, xyz(FIELD, "xyz", MICROTESLA))
+    return imu_part(f"/phone/{kind}", xyz(ACC if kind == "acc" else GYR, "xyz"))
 
 
 def _about(path: Path) -> dict[str, str]:

@@ -21,8 +21,8 @@ from ..phonelog import (
     FIELD,
     MAG,
     MICROTESLA,
-    Part,
     Stream,
+    StreamChannel,
     declared,
     fix_part,
     imu_part,
@@ -63,14 +63,14 @@ class AndroidText:
         places = {k: k for k in ("lat", "lon", "alt") if k in names}
         parts = [
             imu_part("/phone/acc", xyz(ACC, ("ax", "ay", "az")), gravity="included"),
-            Part("/phone/mag", MAG, xyz(FIELD, ("mx", "my", "mz"), MICROTESLA)),
+            StreamChannel("/phone/mag", MAG, xyz(FIELD, ("mx", "my", "mz"), MICROTESLA)),
             fix_part(places),
         ]
         stream = Stream(parts, report, attachments=attachments)
-        said = [
+        entries = [
             x.lstrip("@ ").strip() for x in head.decode("utf-8", "replace").split("\n") if x.startswith("@")
         ]
-        pairs = (x.partition(":") for x in said)
+        pairs = (x.partition(":") for x in entries)
         return Import(
             channels=declared([stream]),
             blocks=_blocks(path, names, stream, report),

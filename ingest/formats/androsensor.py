@@ -29,9 +29,9 @@ from ..phonelog import (
     QUAT,
     QUATERNION,
     VALUES,
-    Part,
-    Source,
+    SourceColumn,
     Stream,
+    StreamChannel,
     declared,
     fix_part,
     imu_part,
@@ -143,27 +143,29 @@ def _known(names: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def _parts(path: Path, known: dict[str, str]) -> list[Part]:
+def _parts(path: Path, known: dict[str, str]) -> list[StreamChannel]:
     def three(key: str) -> list[str]:
         names = [known.get(f"{key} {a}", "") for a in "xyz"]
         return names if all(names) else []
 
-    imu: dict[str, Source] = {}
+    imu: dict[str, SourceColumn] = {}
     if names := three("acc"):
         imu |= xyz(ACC, names)
     if names := three("gyr"):
         imu |= xyz(GYR, names)
     parts = [imu_part("/phone/imu", imu, gravity="included")] if imu else []
     if names := three("linear"):
-        parts.append(Part("/phone/linear_acc", VALUES, xyz(ACC, names), ACC, metadata={"gravity": "removed"}))
+        parts.append(
+            StreamChannel("/phone/linear_acc", VALUES, xyz(ACC, names), ACC, metadata={"gravity": "removed"})
+        )
     if names := three("mag"):
-        parts.append(Part("/phone/mag", MAG, xyz(FIELD, names, MICROTESLA)))
+        parts.append(StreamChannel("/phone/mag", MAG, xyz(FIELD, names, MICROTESLA)))
     angles = [known.get(a, "") for a in ("azimuth", "pitch", "roll")]
     if all(angles):
         parts.append(orientation_part(angles))
     if "pressure" in known:
-        source = {"pressure_pa": Source(known["pressure"], HECTOPASCAL)}
-        parts.append(Part("/phone/pressure", PRESSURE, source, held=True))
+        source = {"pressure_pa": SourceColumn(known["pressure"], HECTOPASCAL)}
+        parts.append(StreamChannel("/phone/pressure", PRESSURE, source, held=True))
     if "lat" in known and "lon" in known:
         parts.append(fix_part({k: known[k] for k in ("lat", "lon", "alt", "accuracy") if k in known}))
     if not parts:
@@ -171,14 +173,14 @@ def _parts(path: Path, known: dict[str, str]) -> list[Part]:
     return parts
 
 
-def orientation_part(names: Sequence[str]) -> Part:
+def orientation_part(names: Sequence[str]) -> StreamChannel:
     """Return the phone's own orientation, from columns of azimuth, pitch and roll in degrees."""
 
     def make(frame: pl.DataFrame) -> dict[str, np.ndarray]:
         return quaternion_of(*(np.radians(frame[n].to_numpy()) for n in names))
 
     about = {"north": "magnetic", "source": "azimuth, pitch and roll of the phone"}
-    return Part("/phone/orientation", QUATERNION, make, QUAT, metadata=about)
+    return StreamChannel("/phone/orientation", QUATERNION, make, QUAT, metadata=about)
 
 
 def _blocks(

@@ -100,10 +100,10 @@ def _read(path: Path) -> tuple[dict[str, Any], np.ndarray]:
         raise MarchaError(f"{path}: reading it took more than {READ_S:g} s: a damaged C3D file?") from None
     head, _, data = done.stdout.partition(b"\n")
     if done.returncode:
-        said = done.stderr.decode("utf-8", "replace").strip().splitlines()
+        messages = done.stderr.decode("utf-8", "replace").strip().splitlines()
         why = (
-            said[-1][:120]
-            if said and done.returncode > 0
+            messages[-1][:120]
+            if messages and done.returncode > 0
             else f"its reader ended with signal {-done.returncode}"
         )
         raise MarchaError(f"{path}: a damaged C3D file ({why}); export it again")

@@ -18,7 +18,7 @@ from ...recording.errors import MarchaError
 from ..contract import CommonOptions, Import, ReportBuilder
 from ..leg import IMU, JOINTS, MAG, FloatArray
 from ..legchecks import unwrapped
-from ..mapping import Cell, Layout, Mapping, Strict, Time, Topic
+from ..mapping import CellSource, Mapping, Strict, TextLayout, Time, Topic
 from .table import open_table
 
 AXES = "xyz"
@@ -59,7 +59,7 @@ class Segment(Strict, frozen=True, kw_only=True):
     units: dict[str, str] = msgspec.field(default_factory=dict)
 
 
-class Encoder(Strict, frozen=True, kw_only=True):
+class EncoderColumn(Strict, frozen=True, kw_only=True):
     """One joint with an encoder: angle = sign · (reading − zero).
 
     Attributes
@@ -88,9 +88,9 @@ class ExoMapping(Strict, frozen=True, kw_only=True):
     """A whole mapping; ``time`` and ``layout`` as in a table's."""
 
     segment: dict[_Name, Segment]
-    joint: dict[_Name, Encoder] = msgspec.field(default_factory=dict)
+    joint: dict[_Name, EncoderColumn] = msgspec.field(default_factory=dict)
     time: Time = Time(column="time")
-    layout: Layout = Layout()
+    layout: TextLayout = TextLayout()
     units: dict[str, str]
     device: dict[str, str] = msgspec.field(default_factory=dict)
 
@@ -160,8 +160,8 @@ def _read_mapping(map_file: Path, path: Path) -> ExoMapping:
     except OSError as error:
         raise MarchaError(f"{map_file}: cannot be read: {error.strerror or error}") from error
     except msgspec.ValidationError as error:
-        said, _, where = str(error).partition(" - at `$")
-        raise MarchaError(f"{map_file}: {where.rstrip('`').lstrip('.') or 'top level'}: {said}") from error
+        reason, _, where = str(error).partition(" - at `$")
+        raise MarchaError(f"{map_file}: {where.rstrip('`').lstrip('.') or 'top level'}: {reason}") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise MarchaError(f"{map_file}: not TOML: {error}") from error
     if not mapping.segment:
@@ -197,7 +197,7 @@ def _table(map_file: Path, mapping: ExoMapping) -> Mapping:
         if segment.mounting_wxyz is not None or segment.mounting_deg is not None:
             frame = name
             metadata |= {"axes": "segment", "mounting_wxyz": _text(_quat(segment))}
-        columns: dict[str, Cell | str | int] = {
+        columns: dict[str, CellSource | str | int] = {
             f"{kind}_{a}": c for kind, cells in named.items() for a, c in zip(AXES, cells, strict=True)
         }
         topics.append(
@@ -221,7 +221,7 @@ def _table(map_file: Path, mapping: ExoMapping) -> Mapping:
 
 
 def _encoders(map_file: Path, mapping: ExoMapping) -> Topic:
-    columns: dict[str, Cell | str | int] = {}
+    columns: dict[str, CellSource | str | int] = {}
     metadata: dict[str, str] = {}
     for name, joint in mapping.joint.items():
         unit = joint.unit or mapping.units.get("enc")
@@ -230,7 +230,7 @@ def _encoders(map_file: Path, mapping: ExoMapping) -> Topic:
                 f"{map_file}: joint.{name}.unit: {unit!r} is neither 'deg' nor 'rad' (units.enc)"
             )
         rad = 1.0 if unit == "rad" else np.pi / 180
-        columns[name] = Cell(
+        columns[name] = CellSource(
             column=f"{name}_enc" if joint.column is None else joint.column,
             unit=unit,
             scale=float(joint.sign),

@@ -29,9 +29,9 @@ from ..phonelog import (
     QUAT,
     QUATERNION,
     RADIO,
-    Part,
-    Source,
+    SourceColumn,
     Stream,
+    StreamChannel,
     declared,
     fix_part,
     imu_part,
@@ -118,17 +118,19 @@ class GetSensorData:
 def _stream(topic: str, report: ReportBuilder) -> Stream:
     axes = ("x", "y", "z")
     if topic == "/phone/radio":
-        return Stream([Part(topic, RADIO, radio_columns)], report, subject="signals", events=True)
+        return Stream([StreamChannel(topic, RADIO, radio_columns)], report, subject="signals", events=True)
     if topic == "/reference/fix":
-        columns = {"lat_deg": Source("lat", 1.0), "lon_deg": Source("lon", 1.0)}
-        part = Part(topic, FIX, columns, frame_id="wgs84", metadata={"source": "surveyed points"})
+        columns = {"lat_deg": SourceColumn("lat", 1.0), "lon_deg": SourceColumn("lon", 1.0)}
+        part = StreamChannel(topic, FIX, columns, frame_id="wgs84", metadata={"source": "surveyed points"})
         return Stream([part], report, subject="surveyed points", events=True)
     parts = {
         "/phone/acc": imu_part(topic, xyz(ACC, axes), gravity="included"),
         "/phone/gyr": imu_part(topic, xyz(GYR, axes)),
-        "/phone/mag": Part(topic, MAG, xyz(FIELD, axes, MICROTESLA)),
-        "/phone/pressure": Part(topic, PRESSURE, {"pressure_pa": Source("x", HECTOPASCAL)}),
-        "/phone/orientation": Part(topic, QUATERNION, _rotation, QUAT, metadata={"north": "magnetic"}),
+        "/phone/mag": StreamChannel(topic, MAG, xyz(FIELD, axes, MICROTESLA)),
+        "/phone/pressure": StreamChannel(topic, PRESSURE, {"pressure_pa": SourceColumn("x", HECTOPASCAL)}),
+        "/phone/orientation": StreamChannel(
+            topic, QUATERNION, _rotation, QUAT, metadata={"north": "magnetic"}
+        ),
         "/phone/gnss": fix_part({"lat": "lat", "lon": "lon", "alt": "alt", "accuracy": "accuracy"}),
     }
     return Stream([parts[topic]], report, subject=topic, even=topic != "/phone/gnss")

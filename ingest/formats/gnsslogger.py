@@ -19,8 +19,8 @@ from ..phonelog import (
     GYR,
     MAG,
     MICROTESLA,
-    Part,
     Stream,
+    StreamChannel,
     declared,
     fix_part,
     imu_part,
@@ -84,7 +84,7 @@ class GnssLogger:
                 continue
             axes = ("x", "y", "z")
             part = (
-                Part(topic, MAG, xyz(FIELD, axes, MICROTESLA))
+                StreamChannel(topic, MAG, xyz(FIELD, axes, MICROTESLA))
                 if topic == "/phone/mag"
                 else imu_part(topic, xyz(ACC if topic == "/phone/acc" else GYR, axes))
             )

@@ -30,9 +30,9 @@ from ..phonelog import (
     QUAT,
     QUATERNION,
     RADIO,
-    Part,
-    Source,
+    SourceColumn,
     Stream,
+    StreamChannel,
     declared,
     fix_part,
     imu_part,
@@ -147,19 +147,19 @@ def _stream(topic: str, report: ReportBuilder) -> Stream:
     elif topic == "/phone/gyr":
         part = imu_part(topic, xyz(GYR, axes))
     elif topic == "/phone/mag":
-        part = Part(topic, MAG, xyz(FIELD, axes, MICROTESLA))
+        part = StreamChannel(topic, MAG, xyz(FIELD, axes, MICROTESLA))
     elif topic == "/phone/orientation":
-        part = Part(
+        part = StreamChannel(
             topic, QUATERNION, _rotation, QUAT, metadata={"north": "magnetic", "source": "rotation vector"}
         )
     elif topic == "/phone/pressure":
-        part = Part(topic, PRESSURE, {"pressure_pa": Source("x", HECTOPASCAL)})
+        part = StreamChannel(topic, PRESSURE, {"pressure_pa": SourceColumn("x", HECTOPASCAL)})
     elif topic == "/phone/gnss":
         part = fix_part({"lat": "lat", "lon": "lon", "alt": "alt"})
     elif topic == "/phone/radio":
-        return Stream([Part(topic, RADIO, radio_columns)], report, subject="signals", events=True)
+        return Stream([StreamChannel(topic, RADIO, radio_columns)], report, subject="signals", events=True)
     else:
-        part = Part(topic, POINT, _point, ("pos_x", "pos_y", "pos_z"), frame_id="plan")
+        part = StreamChannel(topic, POINT, _point, ("pos_x", "pos_y", "pos_z"), frame_id="plan")
         return Stream([part], report, subject="waypoints", events=True)
     return Stream([part], report, subject=topic, even=topic != "/phone/gnss")
 

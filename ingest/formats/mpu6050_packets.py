@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 
 from ...recording.errors import MarchaError
 from ..checks import SensorCheck
-from ..clock import Clock
 from ..contract import (
     HEAD_BYTES,
     ChannelSpec,
     Import,
     ReportBuilder,
 )
+from ..timestamps import TimestampRepair
 from .mpu6050 import (
     AXES,
     IMU,
@@ -196,7 +196,7 @@ class _Sensor:
         self.topic = f"/foot/imu{number}"
         self._scale = scale
         self._report = report
-        self._clock = Clock(report, tick_ns=1_000_000, period=2**32, subject=f"{self.topic}: ")
+        self._clock = TimestampRepair(report, tick_ns=1_000_000, period=2**32, subject=f"{self.topic}: ")
         self._check = SensorCheck(report, self.topic, AXES, limits=scale.limits())
 
     def feed(

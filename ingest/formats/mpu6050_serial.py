@@ -18,9 +18,9 @@ import polars as pl
 
 from ...recording.errors import MarchaError
 from ..checks import SensorCheck
-from ..clock import Clock
 from ..contract import HEAD_BYTES, Import, ReportBuilder
-from ..text import Rows, integer_rows
+from ..text import IntegerRows, integer_rows
+from ..timestamps import TimestampRepair
 from .mpu6050 import (
     AXES,
     Mpu6050Options,
@@ -80,7 +80,7 @@ class Mpu6050Serial:
 def _blocks(
     paths: Sequence[Path], scale: dict[int, Scale], report: ReportBuilder, device: dict[str, str]
 ) -> Iterator[tuple[str, pl.DataFrame]]:
-    clock = Clock(report, tick_ns=1_000_000, period=2**32)
+    clock = TimestampRepair(report, tick_ns=1_000_000, period=2**32)
     checks = {s: SensorCheck(report, f"/foot/imu{s}", AXES, limits=scale[s].limits()) for s in (1, 2)}
     wall = _WallClock()
     for frame in clock.stream(_frames(paths, report, wall)):
@@ -122,7 +122,7 @@ class _WallClock:
         self._seen: list[tuple[int, int]] = []
         self._rows = 0
 
-    def feed(self, rows: Rows) -> None:
+    def feed(self, rows: IntegerRows) -> None:
         at = np.flatnonzero(rows.wall_ms >= 0)
         if not at.size:
             return

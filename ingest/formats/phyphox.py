@@ -28,9 +28,9 @@ from ..phonelog import (
     MICROTESLA,
     PRESSURE,
     VALUES,
-    Part,
-    Source,
+    SourceColumn,
     Stream,
+    StreamChannel,
     declared,
     fix_part,
     imu_part,
@@ -174,7 +174,7 @@ def _header(file: Path) -> Header:
     return require_header(file, _is_header, WANTED)
 
 
-def _part(file: Path, header: Header) -> Part | None:
+def _part(file: Path, header: Header) -> StreamChannel | None:
     """Return the channel of a file, from units and names; None for what is no sensor of a walk."""
     cells = {n: m for n in header.names if (m := _CELL.fullmatch(n))}
     fix = {_FIX[w]: n for n, m in cells.items() if (w := m["what"].lower()) in _FIX}
@@ -187,21 +187,23 @@ def _part(file: Path, header: Header) -> Part | None:
         if m["unit"] in _UNITS and axis in ("x", "y", "z") and axis not in by_axis:
             by_axis[axis], quantity = name, _UNITS[m["unit"]]
         elif m["unit"] == "hPa":
-            return Part("/phone/pressure", PRESSURE, {"pressure_pa": Source(name, HECTOPASCAL)})
+            return StreamChannel(
+                "/phone/pressure", PRESSURE, {"pressure_pa": SourceColumn(name, HECTOPASCAL)}
+            )
     if len(by_axis) < 3:
         return None
     names = [by_axis[a] for a in "xyz"]
     if quantity == "acc" and (
         "linear" in names[0].lower() or "linear" in file.stem.lower() or "without" in file.stem
     ):
-        return Part(
+        return StreamChannel(
             "/phone/linear_acc", VALUES, xyz(ACC, names), ACC, metadata={"gravity": "removed by the phone"}
         )
     if quantity == "acc":
         return imu_part("/phone/acc", xyz(ACC, names), gravity="included")
     if quantity == "gyr":
         return imu_part("/phone/gyr", xyz(GYR, names))
-    return Part("/phone/mag", MAG, xyz(FIELD, names, MICROTESLA))
+    return StreamChannel("/phone/mag", MAG, xyz(FIELD, names, MICROTESLA))
 
 
 def _beside(path: Path, name: str) -> Path | None:

@@ -22,7 +22,7 @@ from ..leg import (
     renamed,
     rotations,
 )
-from ..mapping import Cell, Layout, Mapping, Time, Topic
+from ..mapping import CellSource, Mapping, TextLayout, Time, Topic
 from ..text import read_blocks
 from .table import open_table
 
@@ -102,8 +102,8 @@ def _names(paths: Sequence[Path]) -> list[str]:
 
 
 def _mapping(segment: str, tesla: float) -> Mapping:
-    def cells(first: int, names: Sequence[str], scale: float = 1.0) -> dict[str, Cell | str | int]:
-        return {n: Cell(column=first + k, scale=scale) for k, n in enumerate(names)}
+    def cells(first: int, names: Sequence[str], scale: float = 1.0) -> dict[str, CellSource | str | int]:
+        return {n: CellSource(column=first + k, scale=scale) for k, n in enumerate(names)}
 
     inertial = [f"{kind}_{a}" for kind in ("acc", "gyr") for a in "xyz"]
     frame = f"{segment}_imu"
@@ -122,7 +122,7 @@ def _mapping(segment: str, tesla: float) -> Mapping:
             frame="vicon",
         ),
     ]
-    layout = Layout(separator=";", header=False, skip_rows=2)
+    layout = TextLayout(separator=";", header=False, skip_rows=2)
     return Mapping(topic=topics, time=Time(column=1, unit="s"), layout=layout)
 
 

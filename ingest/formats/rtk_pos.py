@@ -16,13 +16,13 @@ import numpy as np
 import polars as pl
 
 from ..cells import Cells
-from ..clock import Clock
 from ..columns import careful_block
 from ..contract import HEAD_BYTES, ChannelSpec, CommonOptions, Import, ReportBuilder
 from ..inertial import one_file
-from ..mapping import Layout
+from ..mapping import TextLayout
 from ..phonelog import FIX, Stream, require_rows
 from ..text import start_of
+from ..timestamps import TimestampRepair
 
 _ROW = re.compile(
     rb"(?m)^\s*\d{4}[-/]\d\d[-/]\d\d\s+\d\d:\d\d:\d\d(\.\d+)?\s+-?\d{1,2}\s+\d{1,2}\s+\d{1,2}\.\d+\s+-?\d{1,3}\s+"
@@ -79,8 +79,8 @@ class RtkPos:
 def _blocks(path: Path, options: RtkPosOptions, report: ReportBuilder) -> Iterator[tuple[str, pl.DataFrame]]:
     head = start_of(path, HEAD_BYTES).replace(b"\r\n", b"\n").split(b"\n")
     first = next((k for k, row in enumerate(head) if _ROW.match(row)), 0)
-    cells = Cells(path, Layout(separator="blanks", header=False, skip_rows=first))
-    clock = Clock(report, tick_ns=1, subject="survey: ")
+    cells = Cells(path, TextLayout(separator="blanks", header=False, skip_rows=first))
+    clock = TimestampRepair(report, tick_ns=1, subject="survey: ")
     kept = Stream((), report)
     places = {f"c{i}": name for i, name in enumerate(NAMES)}
     kinds: dict[str, Any] = {c: pl.String if n in ("date", "time") else pl.Float64 for c, n in places.items()}

@@ -28,7 +28,7 @@ from ..leg import (
     rotations,
     unseen,
 )
-from ..mapping import Cell, Layout, Mapping, Time, Topic
+from ..mapping import CellSource, Mapping, TextLayout, Time, Topic
 from ..text import read_blocks
 from .table import open_table
 
@@ -84,12 +84,12 @@ class SegmentsCsv:
             )
         units = _UNITS.search(head[:4096])
         if units is not None and not units[1].startswith(b"seconds/meters/radians"):
-            said = units[1].decode("utf-8", "replace")
-            raise MarchaError(f"{path}: units are {said!r}, not seconds/meters/radians; import it with --map")
+            unit = units[1].decode("utf-8", "replace")
+            raise MarchaError(f"{path}: units are {unit!r}, not seconds/meters/radians; import it with --map")
         report = ReportBuilder()
         topics = _topics(header, options, path)
         note_arbitrary(report, [t.name for t in topics if t.schema == MAG], options.field_ut)
-        layout = Layout(separator=header.separator, skip_rows=header.line - 1)
+        layout = TextLayout(separator=header.separator, skip_rows=header.line - 1)
         mapping = Mapping(topic=topics, time=Time(rate_hz=float(rate[1])), layout=layout)
         channels, blocks = open_table(path, mapping, path, report)
         turning = [t.name for t in topics if t.schema == ORIENTATION]
@@ -111,7 +111,7 @@ def _topics(header: Header, options: SegmentsOptions, path: Path) -> list[Topic]
     parts = [(c, m) for c in header.names if (m := _COLUMN.fullmatch(c))]
     own = list(dict.fromkeys(m["segment"] for _, m in parts))
     names = renamed(own, options.segments, path)
-    groups: dict[tuple[str, str], dict[str, Cell | str | int]] = {}
+    groups: dict[tuple[str, str], dict[str, CellSource | str | int]] = {}
     for column, m in parts:
         segment = names[m["segment"]]
         if m["marker"]:
@@ -123,7 +123,7 @@ def _topics(header: Header, options: SegmentsOptions, path: Path) -> list[Topic]
         else:
             key, target = (f"/leg/{segment}/imu", IMU), f"{m['kind']}_{m['axis']}"
         scaled = m["kind"] == "mag"
-        groups.setdefault(key, {})[target] = Cell(
+        groups.setdefault(key, {})[target] = CellSource(
             column=column, scale=options.field_ut * 1e-6 if scaled else 1.0
         )
     return [

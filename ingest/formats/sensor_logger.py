@@ -30,9 +30,9 @@ from ..phonelog import (
     MICROTESLA,
     PRESSURE,
     VALUES,
-    Part,
-    Source,
+    SourceColumn,
     Stream,
+    StreamChannel,
     declared,
     fix_part,
     imu_part,
@@ -93,8 +93,10 @@ class SensorLogger:
         attachments: list[SourceAttachment] = []
         tables, about = _tables(path, report)
         platform = options.platform or about.get("platform", "").lower()
-        said = about.get("standardisation", "").lower()
-        standard = options.standardised if options.standardised is not None else said in ("true", "1", "yes")
+        stated = about.get("standardisation", "").lower()
+        standard = (
+            options.standardised if options.standardised is not None else stated in ("true", "1", "yes")
+        )
         if platform not in ("android", "ios"):
             report.note(
                 "assumed_platform",
@@ -246,7 +248,9 @@ def _streams(
             "gravity_free",
             "Accelerometer has no gravity and neither Gravity nor TotalAcceleration was recorded: no attitude from it",
         )
-        part = Part("/phone/linear_acc", VALUES, xyz(ACC, axes, sign), ACC, metadata={"gravity": "removed"})
+        part = StreamChannel(
+            "/phone/linear_acc", VALUES, xyz(ACC, axes, sign), ACC, metadata={"gravity": "removed"}
+        )
         yield Stream([part], report, subject="Accelerometer"), tables["Accelerometer"]
     for topic, names in (("/phone/gyr", "Gyroscope"), ("/phone/mag", "Magnetometer")):
         name = next((n for n in (names, f"{names}Uncalibrated") if n in tables), None)
@@ -254,7 +258,7 @@ def _streams(
             part = (
                 imu_part(topic, xyz(GYR, axes), source=name)
                 if names == "Gyroscope"
-                else Part(topic, MAG, xyz(FIELD, axes, MICROTESLA), metadata={"source": name})
+                else StreamChannel(topic, MAG, xyz(FIELD, axes, MICROTESLA), metadata={"source": name})
             )
             yield Stream([part], report, subject=name), tables[name]
     name = next((n for n in ("LocationGps", "Location") if n in tables), None)
@@ -268,10 +272,12 @@ def _streams(
             fixes = Stream([fix_part(columns)], report, subject=name, even=False, attachments=attachments)
             yield fixes, tables[name]
     if "Barometer" in tables and "pressure" in tables["Barometer"].columns:
-        part = Part("/phone/pressure", PRESSURE, {"pressure_pa": Source("pressure", HECTOPASCAL)})
+        part = StreamChannel(
+            "/phone/pressure", PRESSURE, {"pressure_pa": SourceColumn("pressure", HECTOPASCAL)}
+        )
         yield Stream([part], report, subject="Barometer", even=False), tables["Barometer"]
     if "Pedometer" in tables and "steps" in tables["Pedometer"].columns:
-        part = Part("/phone/steps", VALUES, {"steps": Source("steps", 1.0)}, ("steps",))
+        part = StreamChannel("/phone/steps", VALUES, {"steps": SourceColumn("steps", 1.0)}, ("steps",))
         yield Stream([part], report, subject="Pedometer", even=False), tables["Pedometer"]
 
 

@@ -26,7 +26,6 @@ import polars as pl
 
 from ...recording.errors import MarchaError, UsageError
 from ...recording.provenance import hash_file
-from ..clock import Clock
 from ..columns import (
     Header,
     find_header,
@@ -47,14 +46,15 @@ from ..inertial import (
     MAG,
     MIRRORS,
     SI,
+    ChannelColumns,
     Mirror,
-    Plan,
-    Source,
+    SourceColumn,
     complete,
     note_mirror,
     note_unused,
     tables,
 )
+from ..timestamps import TimestampRepair
 from ..units import conversion
 
 WANTED = "Time,<node>:scaledAccelX,…"
@@ -125,10 +125,10 @@ class SensorConnectCsv:
         angles = next((n for a in _ANGLES if set(n := [f"{node}:{x}" for x in a]) <= set(header.names)), [])
         imu = complete(columns, ACC) | complete(columns, GYR)
         if angles:
-            imu |= {q: Source(q, 1.0) for q in QUAT}
-        plans = [Plan("/foot/imu", IMU, imu, metadata={"node": node})]
+            imu |= {q: SourceColumn(q, 1.0) for q in QUAT}
+        plans = [ChannelColumns("/foot/imu", IMU, imu, metadata={"node": node})]
         if field := complete(columns, FIELD):
-            plans.append(Plan("/foot/mag", MAG, field, metadata={"node": node}))
+            plans.append(ChannelColumns("/foot/mag", MAG, field, metadata={"node": node}))
         used = {s.name for p in plans for s in p.columns.values()} | {"Time", *angles}
         flags = {f"{n}{_VALID}" for n in used} & set(header.names)
         note_unused(header.names, used | flags, report, header.line)
@@ -147,7 +147,7 @@ class SensorConnectCsv:
             footprints, metadata["truth"] = _footprints(truth, options.mirror)
             note_mirror(options.mirror, truth.name, footprints.height, report)
             specs.append(REFERENCE)
-        clock = Clock(report, tick_ns=1)
+        clock = TimestampRepair(report, tick_ns=1)
         frames = _frames(path, header, angles, sorted(flags), report)
         return Import(
             channels=specs,
@@ -206,13 +206,13 @@ def _node(path: Path, header: Header, wanted: str | None) -> str:
     raise UsageError(f"{path}: {said}; choose one with node=: {', '.join(nodes)}")
 
 
-def _columns(header: Header, node: str) -> dict[str, Source]:
+def _columns(header: Header, node: str) -> dict[str, SourceColumn]:
     found = {}
     for field, (quantity, unit) in _FIELDS.items():
         factor, _ = conversion(unit, SI[quantity])
         for axis in "XYZ":
             if (name := f"{node}:{field}{axis}") in header.names:
-                found[f"{quantity}_{axis.lower()}"] = Source(name, factor)
+                found[f"{quantity}_{axis.lower()}"] = SourceColumn(name, factor)
     return found
 
 

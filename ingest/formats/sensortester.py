@@ -21,9 +21,9 @@ from ..phonelog import (
     MAG,
     MICROTESLA,
     PRESSURE,
-    Part,
-    Source,
+    SourceColumn,
     Stream,
+    StreamChannel,
     declared,
     fix_part,
     imu_part,
@@ -84,7 +84,7 @@ def _is_header(cells: Sequence[str]) -> bool:
     return cells[0] == TIME and any(c.startswith("AccX[") for c in cells)
 
 
-def _parts(named: dict[str, str]) -> tuple[list[Part], set[str]]:
+def _parts(named: dict[str, str]) -> tuple[list[StreamChannel], set[str]]:
     imu = xyz(ACC, [named[f"acc{a}"] for a in "xyz"])
     if all(f"gyro{a}" in named for a in "xyz"):
         imu |= xyz(GYR, [named[f"gyro{a}"] for a in "xyz"])
@@ -92,7 +92,7 @@ def _parts(named: dict[str, str]) -> tuple[list[Part], set[str]]:
     used = {s.name for s in imu.values()}
     if all(f"magn{a}" in named for a in "xyz"):
         mag = xyz(FIELD, [named[f"magn{a}"] for a in "xyz"], MICROTESLA)
-        parts.append(Part("/phone/mag", MAG, mag))
+        parts.append(StreamChannel("/phone/mag", MAG, mag))
         used |= {s.name for s in mag.values()}
     angles = [named.get(f"orien{a}", "") for a in ("yaw", "pitch", "roll")]
     if all(angles):
@@ -100,7 +100,9 @@ def _parts(named: dict[str, str]) -> tuple[list[Part], set[str]]:
         used |= set(angles)
     if "press" in named:
         parts.append(
-            Part("/phone/pressure", PRESSURE, {"pressure_pa": Source(named["press"], 1.0)}, held=True)
+            StreamChannel(
+                "/phone/pressure", PRESSURE, {"pressure_pa": SourceColumn(named["press"], 1.0)}, held=True
+            )
         )
         used.add(named["press"])
     if "lat" in named and "lng" in named:

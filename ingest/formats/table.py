@@ -14,7 +14,6 @@ import polars as pl
 from ...recording.errors import MarchaError
 from ..cells import Cells
 from ..checks import SensorCheck, check_plausible
-from ..clock import Clock
 from ..contract import (
     ChannelSpec,
     CommonOptions,
@@ -30,6 +29,7 @@ from ..mapping import (
     schema_name,
     targets,
 )
+from ..timestamps import TimestampRepair
 
 #: Share of the full scale at which a 16-bit converter says its last count.
 LAST_COUNT = 1 - 1.5 / 32768
@@ -194,7 +194,7 @@ class _File:
         tick = 1 if period is None else TICKS_NS.get(time.unit, 1)
         if time.column is not None and time.rate_hz is not None:  # samples, which are no whole nanoseconds
             tick, period = 1, period and round(period * 1e9 / time.rate_hz)
-        self._clock = Clock(report, tick_ns=tick, period=period, subject=subject, even=time.even)
+        self._clock = TimestampRepair(report, tick_ns=tick, period=period, subject=subject, even=time.even)
         self._tick = tick
         self._checks = {
             topic.name: check for topic, found in self._topics if (check := self._check(topic, found))

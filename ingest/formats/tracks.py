@@ -18,7 +18,7 @@ from ..inertial import one_file
 from ..phonelog import Stream, declared, fix_part, require_rows
 
 
-class TrackOptions(CommonOptions, frozen=True, kw_only=True):
+class TrackImportOptions(CommonOptions, frozen=True, kw_only=True):
     """What the track is.
 
     Attributes
@@ -37,13 +37,13 @@ class Gpx:
 
     name: ClassVar[str] = "gpx"
     title: ClassVar[str] = "GPX track"
-    Options = TrackOptions
+    Options = TrackImportOptions
 
     def sniff(self, head: bytes, path: Path) -> float:
         """Its root element."""
         return 0.95 if b"<gpx" in head[:2048] else 0.0
 
-    def read(self, paths: Sequence[Path], options: TrackOptions) -> Import:
+    def read(self, paths: Sequence[Path], options: TrackImportOptions) -> Import:
         """Read one file."""
         return _track(one_file(paths, self.name), self.name, options, _gpx_points)
 
@@ -53,13 +53,13 @@ class Kml:
 
     name: ClassVar[str] = "kml"
     title: ClassVar[str] = "KML track (gx:Track, or points with a TimeStamp)"
-    Options = TrackOptions
+    Options = TrackImportOptions
 
     def sniff(self, head: bytes, path: Path) -> float:
         """Its root element."""
         return 0.95 if b"<kml" in head[:2048] else 0.0
 
-    def read(self, paths: Sequence[Path], options: TrackOptions) -> Import:
+    def read(self, paths: Sequence[Path], options: TrackImportOptions) -> Import:
         """Read one file."""
         return _track(one_file(paths, self.name), self.name, options, _kml_points)
 
@@ -67,7 +67,9 @@ class Kml:
 Point = tuple[str, float, float, float]
 
 
-def _track(path: Path, name: str, options: TrackOptions, points: Callable[[Path], Iterator[Point]]) -> Import:
+def _track(
+    path: Path, name: str, options: TrackImportOptions, points: Callable[[Path], Iterator[Point]]
+) -> Import:
     report = ReportBuilder()
     topic = "/phone/gnss" if options.role == "fixes" else "/reference/fix"
     part = fix_part({"lat": "lat", "lon": "lon", "alt": "alt"}, topic)

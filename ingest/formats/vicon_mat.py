@@ -17,7 +17,6 @@ import numpy as np
 import polars as pl
 
 from ...recording.errors import MarchaError
-from ..clock import Clock
 from ..contract import (
     ChannelSpec,
     CommonOptions,
@@ -29,14 +28,15 @@ from ..inertial import (
     GYR,
     IMU,
     MIRRORS,
+    ChannelColumns,
     Mirror,
-    Plan,
-    Source,
+    SourceColumn,
     note_mirror,
     one_file,
     tables,
 )
 from ..matfile import MAGIC, Variable, read_mat
+from ..timestamps import TimestampRepair
 
 POSE = ChannelSpec(
     "/reference/pose",
@@ -88,11 +88,11 @@ class ViconMat:
         has_stance = "still" in frame.columns
         report = ReportBuilder()
         note_mirror(options.mirror, "gt", frame.height, report)
-        imu = Plan("/foot/imu", IMU, {a: Source(a, 1.0) for a in (*ACC, *GYR)})
-        plans = [imu, Plan(POSE.topic, POSE.schema, {a: Source(a, 1.0) for a in POSITION})]
+        imu = ChannelColumns("/foot/imu", IMU, {a: SourceColumn(a, 1.0) for a in (*ACC, *GYR)})
+        plans = [imu, ChannelColumns(POSE.topic, POSE.schema, {a: SourceColumn(a, 1.0) for a in POSITION})]
         if has_stance:
-            plans.append(Plan(STANCE.topic, STANCE.schema, {"still": Source("still", 1.0)}))
-        clock = Clock(report, tick_ns=1)
+            plans.append(ChannelColumns(STANCE.topic, STANCE.schema, {"still": SourceColumn("still", 1.0)}))
+        clock = TimestampRepair(report, tick_ns=1)
         return Import(
             channels=[imu.spec(), POSE, *([STANCE] if has_stance else [])],
             blocks=_reference(tables(path, [frame], plans, clock, report), report),

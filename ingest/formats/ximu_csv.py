@@ -16,7 +16,6 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from ..clock import Clock
 from ..columns import (
     Header,
     find_header,
@@ -30,13 +29,14 @@ from ..inertial import (
     GYR,
     IMU,
     MAG,
-    Plan,
+    ChannelColumns,
     complete,
     note_unused,
     one_file,
     tables,
     x_io_columns,
 )
+from ..timestamps import TimestampRepair
 
 COUNTER = "Packet number"
 WANTED = "Packet number,Gyroscope X (deg/s),…,Accelerometer X (g),…"
@@ -79,12 +79,12 @@ class XimuCsv:
             f"1/{options.rate_hz:g} s apart; set rate_hz if the device was set otherwise",
             line=header.line,
         )
-        plans = [Plan("/foot/imu", IMU, complete(columns, ACC) | complete(columns, GYR))]
+        plans = [ChannelColumns("/foot/imu", IMU, complete(columns, ACC) | complete(columns, GYR))]
         if field := complete(columns, FIELD):
-            plans.append(Plan("/foot/mag", MAG, field, held=True))
+            plans.append(ChannelColumns("/foot/mag", MAG, field, held=True))
         used = {s.name for p in plans for s in p.columns.values()} | {COUNTER}
         note_unused(header.names, used, report, header.line)
-        clock = Clock(report, tick_ns=1, even=False)
+        clock = TimestampRepair(report, tick_ns=1, even=False)
         return Import(
             channels=[p.spec() for p in plans],
             blocks=tables(path, _frames(path, header, options.rate_hz, report), plans, clock, report),

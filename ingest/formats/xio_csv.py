@@ -12,7 +12,6 @@ from typing import ClassVar
 
 import polars as pl
 
-from ..clock import Clock
 from ..columns import (
     Header,
     find_header,
@@ -26,14 +25,15 @@ from ..inertial import (
     GYR,
     IMU,
     MAG,
-    Plan,
-    Source,
+    ChannelColumns,
+    SourceColumn,
     complete,
     note_unused,
     one_file,
     tables,
     x_io_columns,
 )
+from ..timestamps import TimestampRepair
 
 WANTED = "Time (s),Gyroscope X (deg/s),…,Accelerometer X (g),…"
 
@@ -59,12 +59,12 @@ class XioCsv:
         header = require_header(path, _is_header, WANTED)
         columns = x_io_columns(path, header.names, header.line)
         report = ReportBuilder()
-        plans = [Plan("/foot/imu", IMU, complete(columns, ACC) | complete(columns, GYR))]
+        plans = [ChannelColumns("/foot/imu", IMU, complete(columns, ACC) | complete(columns, GYR))]
         if field := complete(columns, FIELD):
-            plans.append(Plan("/foot/mag", MAG, field))
+            plans.append(ChannelColumns("/foot/mag", MAG, field))
         used = [columns["t"].name, *(s.name for p in plans for s in p.columns.values())]
         note_unused(header.names, used, report, header.line)
-        clock = Clock(report, tick_ns=1)
+        clock = TimestampRepair(report, tick_ns=1)
         return Import(
             channels=[p.spec() for p in plans],
             blocks=tables(path, _frames(path, header, columns["t"], report), plans, clock, report),
@@ -85,6 +85,6 @@ def _is_header(cells: Sequence[str]) -> bool:
     return timed and any(c.startswith(("Accelerometer X", "Gyroscope X")) for c in cells)
 
 
-def _frames(path: Path, header: Header, time: Source, report: ReportBuilder) -> Iterator[pl.DataFrame]:
+def _frames(path: Path, header: Header, time: SourceColumn, report: ReportBuilder) -> Iterator[pl.DataFrame]:
     for frame in float_blocks(path, header, time.name, report):
         yield frame.with_columns(t=(pl.col(time.name) * time.factor).round().cast(pl.Int64)).drop(time.name)

@@ -29,7 +29,7 @@ from ..leg import (
     renamed,
     rotations,
 )
-from ..mapping import Cell, Layout, Mapping, Time, Topic
+from ..mapping import CellSource, Mapping, TextLayout, Time, Topic
 from ..text import read_blocks
 from .table import open_table
 
@@ -114,7 +114,7 @@ class XsensText:
             rates.add(rate)
             topics = _topics(names[key], header, path, options.field_ut * 1e-6)
             magnetic += [t.name for t in topics if t.schema == MAG]
-            layout = Layout(separator=header.separator, skip_rows=header.line - 1, comment="//")
+            layout = TextLayout(separator=header.separator, skip_rows=header.line - 1, comment="//")
             counter = next(c for c in COUNTERS if c in header.names)
             time = Time(column=counter, rate_hz=rate, rollover=COUNTER_PERIOD)
             specs, blocks = open_table(path, Mapping(topic=topics, time=time, layout=layout), path, report)
@@ -171,11 +171,11 @@ def _topics(segment: str, header: _Header, path: Path, tesla: float) -> list[Top
     have = set(header.names)
     frame = f"{segment}_imu"
 
-    def axes(kind: str, word: str, scale: float = 1.0) -> dict[str, Cell | str | int]:
+    def axes(kind: str, word: str, scale: float = 1.0) -> dict[str, CellSource | str | int]:
         names = [f"{word}_{a}" for a in "XYZ"]
         if not set(names) <= have:
             return {}
-        return {f"{kind}_{a.lower()}": Cell(column=f"{word}_{a}", scale=scale) for a in "XYZ"}
+        return {f"{kind}_{a.lower()}": CellSource(column=f"{word}_{a}", scale=scale) for a in "XYZ"}
 
     topics = []
     inertial = axes("acc", "Acc") | axes("gyr", "Gyr")
@@ -183,7 +183,7 @@ def _topics(segment: str, header: _Header, path: Path, tesla: float) -> list[Top
         topics.append(Topic(name=f"/leg/{segment}/imu", schema=IMU, columns=inertial, frame=frame))
     if field := axes("mag", "Mag", tesla):
         topics.append(Topic(name=f"/leg/{segment}/mag", schema=MAG, columns=field, frame=frame))
-    columns: dict[str, Cell | str | int] = {}
+    columns: dict[str, CellSource | str | int] = {}
     if quat := next((q for q in QUATERNIONS if set(q) <= have), None):
         columns = {f"quat{k}": c for k, c in enumerate(quat)}
     elif set(MATRIX) <= have:
@@ -204,8 +204,8 @@ def _final(spec: ChannelSpec) -> ChannelSpec:
     if not spec.topic.endswith("/orientation"):
         return spec
     source = re.sub(r"\d", "", spec.columns[0])
-    said = {"source": f"the device's own, from its {source}"}
-    return ChannelSpec(spec.topic, ORIENTATION, spec.frame_id, QUAT, said)
+    metadata = {"source": f"the device's own, from its {source}"}
+    return ChannelSpec(spec.topic, ORIENTATION, spec.frame_id, QUAT, metadata)
 
 
 def _quaternions(blocks: Iterator[tuple[str, pl.DataFrame]]) -> Iterator[tuple[str, pl.DataFrame]]:

@@ -113,7 +113,7 @@ class Motion:
     still: NDArray[np.bool_]
 
 
-class Gait:
+class GaitModel:
     """Footfalls, their timing and the foot's motion between them.
 
     Parameters

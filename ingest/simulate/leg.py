@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...recording.errors import UsageError
-from .legmotion import PERSON, SIDES, Body, Chain, FloatArray, Pose, Task, derivatives
-from .sensors import IDEAL, STANDARD_GRAVITY, Imu, ImuErrors
+from .legmotion import PERSON, SIDES, Body, Chain, FloatArray, MotionTask, Pose, derivatives
+from .sensors import IDEAL, STANDARD_GRAVITY, ImuErrors, SimulatedImu
 from .tissue import SoftTissue, tissue
 from .walks import checked, plain
 
@@ -78,7 +78,7 @@ class LegOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     range_scale : float
         Factor of all flexion angles.
     off_plane_deg, knee_varus_deg, knee_axial_deg, turn_deg_s : float
-        Motion out of the sagittal plane; see :class:`marcha.ingest.simulate.legmotion.Task`. With a varus
+        Motion out of the sagittal plane; see :class:`marcha.ingest.simulate.legmotion.MotionTask`. With a varus
         and axial rotation of 0 the knee is a hinge.
     sides : str
         ``left``, ``right`` or ``both``: names are ``thigh`` of one leg, ``left_thigh`` of two.
@@ -147,7 +147,7 @@ class LegOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
 
 
 @dataclass(frozen=True)
-class Segment:
+class SimulatedSegment:
     """One sensor and its segment, at the inertial sample times.
 
     Attributes
@@ -263,7 +263,7 @@ class LegCapture:
     def __init__(self, scenario: str, seed: int, options: LegOptions) -> None:
         self.scenario, self.seed, self.options = scenario, seed, options
         o = options
-        task = Task(
+        task = MotionTask(
             scenario,
             duration_s=o.duration_s,
             rest_s=min(o.rest_s, o.duration_s / 2),
@@ -301,7 +301,7 @@ class LegCapture:
         return np.random.default_rng([self.seed, *part.encode()])
 
     @cached_property
-    def segments(self) -> dict[str, Segment]:
+    def segments(self) -> dict[str, SimulatedSegment]:
         """Every segment that carries a sensor."""
         names = dict.fromkeys(self._named(p, side) for side in self.sides for p in self.options.segments)
         mounts = {name: self._mount(name) for name in names}
@@ -332,14 +332,14 @@ class LegCapture:
         rot_nb: FloatArray,
         acc_n: FloatArray,
         gyr_b: FloatArray,
-    ) -> Segment:
+    ) -> SimulatedSegment:
         del pos
         force = np.einsum("nji,nj->ni", rot_nb, acc_n + np.array([0.0, 0.0, self.options.gravity]))
         errors = self.options.imu or NOISE[self.options.noise]
-        imu = Imu(errors, self.options.rate_hz, 1e-9, 1e-9, self._rng(f"imu {name}"))
+        imu = SimulatedImu(errors, self.options.rate_hz, 1e-9, 1e-9, self._rng(f"imu {name}"))
         reading = imu.read(force, gyr_b)
         roll, pitch, yaw = euler(truth.rot)
-        return Segment(
+        return SimulatedSegment(
             acc_b=reading[:, :3],
             gyr_b=reading[:, 3:],
             true_acc_b=force,

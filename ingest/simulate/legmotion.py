@@ -55,7 +55,7 @@ class Body:
     toe_m: float = 0.17
 
 
-class Angles(NamedTuple):
+class SegmentAngles(NamedTuple):
     """Attitudes of the segments of one side at given times (rad)."""
 
     trunk: FloatArray  # (n, 3): roll, list, yaw
@@ -91,7 +91,7 @@ def smooth(x: FloatArray) -> FloatArray:
     return x**3 * (10 + x * (6 * x - 15))
 
 
-class Task:
+class MotionTask:
     """What a person does: angles of the segments at any time, and which foot carries.
 
     Parameters
@@ -148,7 +148,7 @@ class Task:
         self._depth = depth
         self._count = count
 
-    def angles(self, t: FloatArray, side: str) -> Angles:
+    def angles(self, t: FloatArray, side: str) -> SegmentAngles:
         """Return the angles of one side at the times ``t`` (s)."""
         flexion = self._walking if self.scenario == "walking" else self._lifting
         phase, gain, trunk, thigh, knee, ankle = flexion(t, side)
@@ -157,7 +157,7 @@ class Task:
         beat, twice = np.sin(2 * np.pi * phase), np.sin(4 * np.pi * phase)
         zero = np.zeros_like(t)
         shared = beat if side == "left" or self.scenario != "walking" else -beat  # both sides have one trunk
-        return Angles(
+        return SegmentAngles(
             np.column_stack((trunk, 0.3 * self._off * gain * shared, heading)),
             np.column_stack((thigh, sway * beat, heading + sway * np.cos(2 * np.pi * phase))),
             np.column_stack((knee, gain * self._knee[0] * beat, gain * self._knee[1] * twice)),
@@ -266,13 +266,13 @@ class Chain:
 
     Parameters
     ----------
-    task : Task
+    task : MotionTask
         What the person does.
     body : Body
         Lengths.
     """
 
-    def __init__(self, task: Task, body: Body) -> None:
+    def __init__(self, task: MotionTask, body: Body) -> None:
         self.task = task
         self.body = body
         knots = np.arange(-0.1, task.duration_s + 0.1 + KNOT_S, KNOT_S)

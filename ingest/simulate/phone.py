@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from ...recording.errors import UsageError
 from .gait import FloatArray
 from .phone_motion import PLACEMENTS, Phone, Walker
-from .phone_routes import PHONE_ROUTES, Route, read_legs, schedule
+from .phone_routes import PHONE_ROUTES, PhoneRoute, read_legs, schedule
 from .phone_world import earth_field, fixes_of, magnetic_disturbance, pressure_of
-from .sensors import IDEAL, Imu, ImuErrors
+from .sensors import IDEAL, ImuErrors, SimulatedImu
 from .walks import checked
 
 _Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -265,7 +265,7 @@ def phone_walk(scenario: str = "phone-turns", *, seed: int = 0, **options: Any) 
 
     route = PHONE_ROUTES[scenario]
     if o.route is not None:
-        route = Route(route.title, read_legs(o.route))
+        route = PhoneRoute(route.title, read_legs(o.route))
     plan = schedule(
         route,
         step_m=o.step_m,
@@ -289,7 +289,7 @@ def phone_walk(scenario: str = "phone-turns", *, seed: int = 0, **options: Any) 
     )
     mag = attitude.inv().apply(field + disturbance)
     ideal = o.errors == "none"
-    imu = Imu(o.imu or (IDEAL if ideal else PHONE_ERRORS), o.rate_hz, ACC_LSB, GYR_LSB, rng("imu"))
+    imu = SimulatedImu(o.imu or (IDEAL if ideal else PHONE_ERRORS), o.rate_hz, ACC_LSB, GYR_LSB, rng("imu"))
     measured = imu.read(acc, gyr)
     mag_b, hard = _magnetometer(mag, o, ideal, rng("mag"))
 

@@ -33,7 +33,7 @@ class Leg(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     handled_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0
 
 
-class Route(NamedTuple):
+class PhoneRoute(NamedTuple):
     """A scenario: what it is, its legs, whether it ends where it began."""
 
     title: str
@@ -47,18 +47,20 @@ def _loop(long: float, short: float) -> tuple[Leg, ...]:
     return (Leg(long / 2, 90), Leg(short, 90), Leg(long, 90), Leg(short, 90), Leg(long / 2))
 
 
-PHONE_ROUTES: dict[str, Route] = {
-    "phone-10m": Route("a phone carried 10 m straight", (Leg(10.0),)),
-    "phone-50m": Route("a phone carried 50 m straight", (Leg(50.0),)),
-    "phone-turns": Route(
+PHONE_ROUTES: dict[str, PhoneRoute] = {
+    "phone-10m": PhoneRoute("a phone carried 10 m straight", (Leg(10.0),)),
+    "phone-50m": PhoneRoute("a phone carried 50 m straight", (Leg(50.0),)),
+    "phone-turns": PhoneRoute(
         "a phone carried 20 m, right, 20 m, left, 10 m", (Leg(20.0, 90), Leg(20.0, -90), Leg(10.0))
     ),
-    "phone-100m": Route(
+    "phone-100m": PhoneRoute(
         "a phone carried 100 m with four turns",
         (Leg(20.0, 90), Leg(20.0, 90), Leg(20.0, -90), Leg(20.0, -90), Leg(20.0)),
     ),
-    "phone-loop": Route("a phone carried round a closed rectangle of 116 m", _loop(36.0, 22.0), closed=True),
-    "phone-city": Route(
+    "phone-loop": PhoneRoute(
+        "a phone carried round a closed rectangle of 116 m", _loop(36.0, 22.0), closed=True
+    ),
+    "phone-city": PhoneRoute(
         "a phone carried 400 m round blocks, with pauses, in two of which it is handled",
         (
             Leg(60.0, 90, pause_s=8.0),
@@ -70,12 +72,12 @@ PHONE_ROUTES: dict[str, Route] = {
             Leg(70.0),
         ),
     ),
-    "phone-floors": Route(
+    "phone-floors": PhoneRoute(
         "a phone carried along corridors and up two flights of stairs",
         (Leg(20.0, 90), Leg(6.0, 180, 3.4), Leg(6.0, -90, 3.4), Leg(25.0, 90), Leg(15.0)),
     ),
-    "phone-rest": Route("a phone that nobody moves", ()),
-    "phone-handled": Route("a phone that is handled by somebody who stands", (), handled=True),
+    "phone-rest": PhoneRoute("a phone that nobody moves", ()),
+    "phone-handled": PhoneRoute("a phone that is handled by somebody who stands", (), handled=True),
 }
 """Scenarios of the phone, by name."""
 
@@ -111,7 +113,7 @@ def read_legs(text: str) -> tuple[Leg, ...]:
 
 
 def schedule(
-    route: Route,
+    route: PhoneRoute,
     *,
     step_m: float,
     step_s: float,
@@ -125,7 +127,7 @@ def schedule(
 
     Parameters
     ----------
-    route : Route
+    route : PhoneRoute
         Legs and pauses.
     step_m, step_s, step_sd : float
         Mean length (m) and time (s) of a step, and the relative standard deviation of both.

@@ -82,21 +82,21 @@ def fixes_of(
     lost = np.zeros(len(t), dtype=bool)
     for begin, length in o.gnss_loss:
         lost |= (t >= begin) & (t < begin + length)
-    said = (truth + error)[~lost]
+    reported = (truth + error)[~lost]
     sigma = float(np.hypot(o.gnss_sigma_m, o.gnss_noise_m))
     lon, lat, _ = Geod(ellps="WGS84").fwd(
-        np.full(len(said), o.lon_deg),
-        np.full(len(said), o.lat_deg),
-        np.degrees(np.arctan2(said[:, 0], said[:, 1])),
-        np.hypot(said[:, 0], said[:, 1]),
+        np.full(len(reported), o.lon_deg),
+        np.full(len(reported), o.lat_deg),
+        np.degrees(np.arctan2(reported[:, 0], reported[:, 1])),
+        np.hypot(reported[:, 0], reported[:, 1]),
     )
-    one = np.full(len(said), sigma)
+    one = np.full(len(reported), sigma)
     return pl.DataFrame(
         {
             "t_ns": start_ns + np.round(t[~lost] * 1e9).astype(np.int64),
             "lat_deg": np.asarray(lat, dtype=np.float64),
             "lon_deg": np.asarray(lon, dtype=np.float64),
-            "alt_m": o.alt_m + said[:, 2],
+            "alt_m": o.alt_m + reported[:, 2],
             "sd_east_m": one,
             "sd_north_m": one,
             "sd_up_m": one * o.gnss_alt_factor,

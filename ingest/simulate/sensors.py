@@ -78,7 +78,7 @@ MPU6050_2 = ImuErrors(gyr_bias=(-0.0126, 0.0015, -0.0132), acc_scale=(0.002, 0.0
 """Sensor 2 of the real device: 1.00 g at rest."""
 
 
-class Imu:
+class SimulatedImu:
     """One sensor in the course of a recording: the drawn turn-on bias, the wandering bias, the noise.
 
     Parameters

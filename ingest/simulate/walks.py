@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...recording.errors import UsageError
 from .gait import (
     FloatArray,
-    Gait,
+    GaitModel,
     Motion,
     Mount,
     Style,
@@ -26,8 +26,8 @@ from .sensors import (
     MPU6050_1,
     MPU6050_2,
     STANDARD_GRAVITY,
-    Imu,
     ImuErrors,
+    SimulatedImu,
 )
 
 T = TypeVar("T", bound=msgspec.Struct)
@@ -193,10 +193,10 @@ def checked(scenario: str, kind: type[T], values: dict[str, Any], prefix: str = 
     try:
         return msgspec.convert(values, kind, strict=False)
     except msgspec.ValidationError as error:
-        said, _, path = str(error).partition(" - at `$.")
+        reason, _, path = str(error).partition(" - at `$.")
         name = path.rstrip("`")
         value = values.get(name.split("[")[0], "")
-        raise UsageError(f"simulate {scenario}: option {prefix}{name}={value!r}: {said}") from None
+        raise UsageError(f"simulate {scenario}: option {prefix}{name}={value!r}: {reason}") from None
 
 
 def plain(value: Any) -> Any:
@@ -280,13 +280,13 @@ class Simulation:
         return route(self.scenario, self.options, self._rng("route"))
 
     @cached_property
-    def gait(self) -> Gait:
+    def gait(self) -> GaitModel:
         """The foot's motion."""
         o = self.options
         rest = o.rest_s
         if self.scenario == "still":
             rest = (o.duration_s or 30.0) / 2
-        return Gait(self.route.footfalls, self.route.durations, rest, o.gravity, o.style)
+        return GaitModel(self.route.footfalls, self.route.durations, rest, o.gravity, o.style)
 
     @property
     def length_m(self) -> float:
@@ -335,12 +335,12 @@ class Simulation:
         """Return truth and ideal readings of sensor 1 or 2 at the times ``t`` (s)."""
         return self.gait.motion(t, self.options.mount(sensor))
 
-    def imu(self, sensor: int, errors: ImuErrors | None = None) -> Imu:
+    def imu(self, sensor: int, errors: ImuErrors | None = None) -> SimulatedImu:
         """Return sensor 1 or 2, at its first sample."""
         o = self.options
         rng = self._rng(f"imu{sensor}")
         acc_lsb, gyr_lsb = o.full_scale(sensor)
-        return Imu(errors or o.imu(sensor), o.rate_hz, acc_lsb, gyr_lsb, rng)
+        return SimulatedImu(errors or o.imu(sensor), o.rate_hz, acc_lsb, gyr_lsb, rng)
 
     def line_rng(self) -> np.random.Generator:
         """Return the random numbers of the serial line: lost and doubled rows."""

@@ -184,9 +184,9 @@ class EstimatorContract(DeclarationContract):
             block, got = self.started(), []
             for a in range(0, len(messages), size):
                 b = min(a + size, len(messages))
-                room = (b - a) * block.max_results
-                whose, when = np.empty(room, np.int64), np.empty(room, np.int64)
-                out = np.empty((room, block.width))
+                capacity = (b - a) * block.max_results
+                whose, when = np.empty(capacity, np.int64), np.empty(capacity, np.int64)
+                out = np.empty((capacity, block.width))
                 n = int(
                     block.run(
                         block.state, inputs[a:b], channels[a:b], t_ns[a:b], values[a:b], whose, when, out

@@ -228,10 +228,10 @@ class Values(View):
 
     def begin(self) -> None:
         canvas = self.canvas
-        said = self.channel.metadata
+        metadata = self.channel.metadata
         columns = list(self.channel.columns)
-        labels = {c: said.get("states", "") for c in columns if c in STATE_COLUMNS}
-        labels |= {k[7:]: v for k, v in said.items() if k.startswith("states.")}
+        labels = {c: metadata.get("states", "") for c in columns if c in STATE_COLUMNS}
+        labels |= {k[7:]: v for k, v in metadata.items() if k.startswith("states.")}
         if self.what == USE:
             labels |= dict.fromkeys(columns, ",used")
         states = [c for c in columns if c in labels]
@@ -243,7 +243,7 @@ class Values(View):
             self.lanes[name] = (Lane(canvas, at, colors), words)
             for tab in (OVERVIEW, self._tab()):
                 canvas.show("lanes", at, tab=tab, panel="lanes", owner=self.owner)
-        unit = said.get("unit", "")
+        unit = metadata.get("unit", "")
         self.shown = {c: shown_as(c, unit) for c in columns if c not in self.lanes}
         self.highest = dict.fromkeys(self.shown, 0.0)
         for number, (name, shown) in enumerate(self.shown.items()):
@@ -335,7 +335,7 @@ def euler_deg(quat_wxyz: Floats) -> Floats:
     return np.degrees(np.column_stack([roll, pitch, yaw]))
 
 
-def shown_as(column: str, unit: str = "") -> style.Column:
+def shown_as(column: str, unit: str = "") -> style.ColumnStyle:
     """Return how a column is shown: by its own entry in the style, in degrees where it is an angle, or with
     its unit.
     """
@@ -343,12 +343,12 @@ def shown_as(column: str, unit: str = "") -> style.Column:
         return style.COLUMNS[column]
     if unit in RAD or (unit in ("", "-", "as named") and column.endswith("_rad")):
         name = column.removesuffix("_rad")
-        return style.Column(f"{name} ({'°' if unit != 'rad/s' else '°/s'})", style.DEGREES)
+        return style.ColumnStyle(f"{name} ({'°' if unit != 'rad/s' else '°/s'})", style.DEGREES)
     unit = "" if unit in ("-", "as named") else unit
-    for suffix, said in style.SUFFIXES.items():
+    for suffix, of_suffix in style.SUFFIXES.items():
         if not unit and column.endswith(suffix):
-            return style.Column(f"{column.removesuffix(suffix)} ({said})")
-    return style.Column(f"{column} ({unit})" if unit else column)
+            return style.ColumnStyle(f"{column.removesuffix(suffix)} ({of_suffix})")
+    return style.ColumnStyle(f"{column} ({unit})" if unit else column)
 
 
 def unit_in(name: str) -> str:

@@ -119,8 +119,8 @@ class Attitudes(Values):
 
     def _show(self, name: str, path: str, panel: str) -> None:
         segment, _, axis = name.rpartition("_")
-        said = f"{segment} {axis} (°)"
-        self.canvas.show("plot", path, tab=JOINTS, panel=said, owner=self.owner, stack=segment, alone=True)
+        panel = f"{segment} {axis} (°)"
+        self.canvas.show("plot", path, tab=JOINTS, panel=panel, owner=self.owner, stack=segment, alone=True)
 
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
         super().draw(t_ns, block)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from marcha.ingest import Report, ReportBuilder
-from marcha.ingest.clock import SLIP_ROWS, Clock
+from marcha.ingest.timestamps import SLIP_ROWS, TimestampRepair
 
 MS = 1_000_000
 
@@ -18,7 +18,7 @@ def run(
 ) -> tuple[list[int], list[int], Report]:
     """Feed ticks of 1 ms; return times in ms, the lines that were kept, and the report."""
     report = ReportBuilder()
-    clock = Clock(report, tick_ns=MS, period=2**32)
+    clock = TimestampRepair(report, tick_ns=MS, period=2**32)
     frame = pl.DataFrame(
         {"t": t, "line": np.arange(1, len(t) + 1), "v": value or list(range(len(t)))},
         schema={"t": pl.Int64, "line": pl.Int64, "v": pl.Int64},

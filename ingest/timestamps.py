@@ -22,7 +22,7 @@ JITTER = 0.1
 ROLLOVER_S = 3600.0
 
 
-class Clock:
+class TimestampRepair:
     """Turns a column of device ticks into time stamps that never decrease.
 
     What it does, and under which name it reports:
