@@ -137,7 +137,7 @@ def folded(table: TextTable, width: int) -> list[TextTable]:
 
 
 def _grid(table: TextTable, *, colour: bool) -> Any:
-    from rich.table import TextTable as Grid
+    from rich.table import Table as Grid
     from rich.text import Text
 
     grid = Grid(box=None, pad_edge=False, padding=(0, GUTTER, 0, 0), header_style="bold" if colour else "")
