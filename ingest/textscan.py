@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import numpy as np
-
-from ..recording.compiled import OPTIONS
 
 ROW, BLANK, CHATTER, FEW, MANY, NOT_A_NUMBER, OUT_OF_RANGE = range(7)
 
@@ -22,8 +22,10 @@ _TAB, _LF, _CR, _SPACE, _COMMA, _SEMICOLON, _COLON, _DOT, _PLUS, _MINUS = (
     45,
 )
 
-_compiled = numba.njit(**OPTIONS)
-_inlined = numba.njit(**OPTIONS, forceinline=True)
+# Without counting references to the arrays (_nrt): numba would do that, atomically, at every call.
+_OPTIONS: Any = {"cache": True, "nogil": True, "_nrt": False}
+_compiled = numba.njit(**_OPTIONS)
+_inlined = numba.njit(**_OPTIONS, forceinline=True)
 
 
 @_inlined

@@ -18,13 +18,8 @@ from .errors import (
     UsageError,
 )
 from .mcapfile import ZSTD_LEVEL
-from .reader import (
-    Attachment,
-    Channel,
-    RecordedMessage,
-    Recording,
-    Window,
-)
+from .model import Attachment, Channel, RecordedMessage, Window
+from .reader import Recording
 from .schemas import SCHEMAS, Column, Schema
 from .writer import Writer
 

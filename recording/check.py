@@ -13,7 +13,8 @@ from .errors import Finding
 from .integrity import structure
 
 if TYPE_CHECKING:
-    from .reader import Channel, Recording
+    from .model import Channel
+    from .reader import Recording
 
 SAMPLED = frozenset(
     {

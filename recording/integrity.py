@@ -11,11 +11,11 @@ from .checksum import crc32
 from .chunks import (
     ChunkError,
     ChunkRef,
-    add_finding,
     read_chunk,
     read_index,
     split,
 )
+from .contents import add_finding
 from .errors import Finding
 
 if TYPE_CHECKING:

@@ -8,12 +8,10 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
-from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
-import msgspec
 import numpy as np
 import polars as pl
 from mcap import records
@@ -32,85 +30,20 @@ from .chunks import (
     ChunkError,
     ChunkRef,
     FileReader,
-    add_finding,
-    find_contents,
     read_chunk,
     read_index,
     split,
 )
-from .codec import (
-    Columns,
-    Decoder,
-    Encoder,
-    Messages,
-)
+from .codec import Columns, Messages
+from .contents import add_finding, find_contents
+from .decoder import Decoder
 from .definitions import load, long_name, parse_full
+from .encoder import Encoder
 from .errors import Finding, MarchaError, UsageError
+from .model import Attachment, Channel, RecordedMessage, Window
 from .schemas import SCHEMAS, Schema
-from .threads import helpers, threads
+from .windows import TIME_TYPES, OrderedPool, between, complete, cut, joined, messages_of
 from .writer import RESERVED
-
-_NOW = {"t_ns": pl.Int64, "t_log_ns": pl.Int64}
-
-
-class Channel(msgspec.Struct, frozen=True):
-    """One channel of a recording.
-
-    Attributes
-    ----------
-    topic, schema, frame_id : str
-        Topic, message type (``package/msg/Name``) and constant frame id.
-    columns : tuple of str
-        Columns of its table, without ``t_ns``; empty where marcha cannot read the messages.
-    count : int
-        Number of messages.
-    start_ns, end_ns : int or None
-        Log time of the first and last message; None where there is none.
-    metadata : dict of str to str
-        What the writer said about the channel.
-    """
-
-    topic: str
-    schema: str
-    frame_id: str
-    columns: tuple[str, ...]
-    count: int
-    start_ns: int | None
-    end_ns: int | None
-    metadata: dict[str, str] = {}
-
-
-class Attachment(msgspec.Struct, frozen=True):
-    """A file inside a recording: name, media type and size in bytes."""
-
-    name: str
-    media_type: str
-    size: int
-
-
-class Window(NamedTuple):
-    """A stretch of log time, half open, with the rows of every channel in it.
-
-    Attributes
-    ----------
-    start_ns, end_ns : int
-        ``start_ns <= t_log_ns < end_ns`` for every row.
-    tables : dict of str to polars.DataFrame
-        Topic to table with ``t_ns``, ``t_log_ns`` and the channel's columns; empty ones are not there.
-    """
-
-    start_ns: int
-    end_ns: int
-    tables: dict[str, pl.DataFrame]
-
-
-class RecordedMessage(NamedTuple):
-    """One message: topic, the time it speaks of, the time it was known, and column name to value."""
-
-    topic: str
-    t_ns: int
-    t_log_ns: int
-    values: dict[str, Any]
 
 
 @dataclass
@@ -291,10 +224,10 @@ class Recording:
         source = self._source(topic)
         refs = self.chunk_refs(set(source.ids), start_ns, end_ns)
         parts: list[Columns] = []
-        with _Pool(len(refs)) as pool:
+        with OrderedPool(len(refs)) as pool:
             for decoded in pool.map(lambda ref: self._decode(ref, [source], start_ns, end_ns), refs):
                 parts += [columns for _, columns in decoded]
-        table = _join(parts) if parts else self._empty(source)
+        table = joined(parts) if parts else self._empty(source)
         return table if log_time else table.drop("t_log_ns")
 
     def windows(
@@ -329,14 +262,14 @@ class Recording:
         ids = {i for s in sources for i in s.ids}
         refs = sorted(self.chunk_refs(ids, start_ns, end_ns), key=lambda r: (r.first_ns, r.start))
         held: dict[str, list[Columns]] = {s.topic: [] for s in sources}
-        with _Pool(len(refs) if ahead else 0) as pool:
+        with OrderedPool(len(refs) if ahead else 0) as pool:
             decoded = pool.map(lambda ref: self._decode(ref, sources, start_ns, end_ns), refs)
             for i, parts in enumerate(decoded):
                 for topic, columns in parts:
                     held[topic].append(columns)
                 horizon = refs[i + 1].first_ns if i + 1 < len(refs) else None
-                if horizon is None or _complete(held, horizon) >= max_rows:
-                    yield from self._emit(held, horizon, max_rows)
+                if horizon is None or complete(held, horizon) >= max_rows:
+                    yield from cut(held, horizon, max_rows)
 
     def messages(
         self, topics: Collection[str] | None = None, start_ns: int | None = None, end_ns: int | None = None
@@ -345,7 +278,7 @@ class Recording:
         order = {t: i for i, t in enumerate(self.sources)}
         for window in self.windows(topics, start_ns, end_ns):
             streams = [
-                _rows(topic, order[topic], table)
+                messages_of(topic, order[topic], table)
                 for topic, table in sorted(window.tables.items(), key=lambda t: order[t[0]])
             ]
             for *_, message in heapq.merge(*streams, key=lambda m: m[:3]):
@@ -452,7 +385,7 @@ class Recording:
         out: list[tuple[str, Columns]] = []
         for id_, messages in sorted(parts.items()):
             source = topic_of[id_]
-            keep = _between(messages, start_ns, end_ns)
+            keep = between(messages, start_ns, end_ns)
             if keep is not None:
                 messages = messages.take(keep)
             if not len(messages.log):
@@ -473,36 +406,6 @@ class Recording:
             self._bad.add(ref.start)
             add_finding(self.findings, "bad_chunk", f"{detail}; skipped")
 
-    def _emit(self, held: dict[str, list[Columns]], horizon: int | None, max_rows: int) -> Iterator[Window]:
-        """Yield windows of ``max_rows`` of what lies before ``horizon``; keep the rest (None: nothing)."""
-        tables = {topic: _join(parts) for topic, parts in held.items() if parts}
-        logs = {topic: table["t_log_ns"].to_numpy() for topic, table in tables.items()}
-        if not logs:
-            return
-        times = np.sort(np.concatenate(list(logs.values())))
-        if horizon is not None:
-            times = times[: np.searchsorted(times, horizon)]
-        if not len(times):
-            return
-        cuts = [int(times[0])]
-        at = 0
-        while at < len(times) and (horizon is None or at + max_rows <= len(times)):
-            at = min(at + max_rows, len(times))
-            if at < len(times):  # a window ends before a log time, never amid rows that share it
-                left = int(np.searchsorted(times, times[at], side="left"))
-                at = left if times[at] > cuts[-1] else int(np.searchsorted(times, times[at], side="right"))
-            cuts.append(int(times[at]) if at < len(times) else int(times[-1]) + 1)
-        for topic, table in tables.items():
-            at = int(np.searchsorted(logs[topic], cuts[-1]))
-            held[topic] = [_columns(table.slice(at))] if at < table.height else []
-        for start, end in pairwise(cuts):
-            window: dict[str, pl.DataFrame] = {}
-            for topic, table in tables.items():
-                i, j = np.searchsorted(logs[topic], (start, end)).tolist()
-                if j > i:
-                    window[topic] = table.slice(i, j - i)
-            yield Window(start, end, window)
-
     def _empty(self, source: TopicSource) -> pl.DataFrame:
         """Return a table without rows, its columns of the types that rows would have."""
         if isinstance(source.decoder, EventDecoder):
@@ -511,7 +414,7 @@ class Recording:
         if channel.count and (first := self._first(source)) is not None:
             return first[0].clear()
         if source.decoder is None or source.decoder.schema is None or not channel.columns:
-            return pl.DataFrame(schema=_NOW)
+            return pl.DataFrame(schema=TIME_TYPES)
         encoder = Encoder(source.decoder.schema, channel.columns, channel.frame_id, channel.topic, 0)
         return source.decoder.decode(_nothing(encoder.blank())).clear()
 
@@ -587,78 +490,7 @@ class Recording:
             return {}
 
 
-class _Pool:
-    """Threads, for at most this many tasks at a time, that keep order and run only a few tasks ahead."""
-
-    def __init__(self, tasks: int) -> None:
-        self._workers = min(threads(), tasks)
-
-    def __enter__(self) -> Self:
-        self._pool = helpers("read", self._workers)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._pool.shutdown(wait=True, cancel_futures=True)
-
-    def map(self, task: Any, items: Sequence[Any]) -> Iterator[Any]:
-        """Yield the result of every item in order."""
-        from collections import deque
-
-        jobs: deque[Any] = deque()
-        for item in items:
-            jobs.append(self._pool.submit(task, item))
-            if len(jobs) > self._workers:
-                yield jobs.popleft().result()
-        while jobs:
-            yield jobs.popleft().result()
-
-
 def _nothing(message: bytes) -> Messages:
     """Return one message at time 0, or none where it is empty."""
     zeros = np.zeros(min(1, len(message)), np.int64)
     return Messages(np.frombuffer(message, "u1"), zeros, zeros + len(message), zeros, zeros)
-
-
-def _between(messages: Messages, start_ns: int | None, end_ns: int | None) -> Any:
-    if start_ns is None and end_ns is None:
-        return None
-    keep = np.ones(len(messages.log), bool)
-    if start_ns is not None:
-        keep &= messages.log >= start_ns
-    if end_ns is not None:
-        keep &= messages.log < end_ns
-    return keep
-
-
-def _join(parts: Sequence[Columns]) -> pl.DataFrame:
-    """Return the parts as one table in log-time order (stable)."""
-    if all(p.keys() == parts[0].keys() and all(isinstance(v, np.ndarray) for v in p.values()) for p in parts):
-        table = pl.DataFrame({k: np.concatenate([p[k] for p in parts]) for k in parts[0]})
-    else:
-        table = pl.concat([pl.DataFrame(p) for p in parts], how="diagonal_relaxed", rechunk=True)
-    return _in_order(table)
-
-
-def _columns(table: pl.DataFrame) -> Columns:
-    """Return a table's columns, as arrays where they are no other than these."""
-    return {
-        s.name: s.to_numpy() if (s.dtype.is_numeric() or s.dtype == pl.Boolean) and not s.null_count() else s
-        for s in table.get_columns()
-    }
-
-
-def _in_order(table: pl.DataFrame) -> pl.DataFrame:
-    return table if table["t_log_ns"].is_sorted() else table.sort("t_log_ns", maintain_order=True)
-
-
-def _complete(held: dict[str, list[Columns]], horizon: int) -> int:
-    logs = (np.asarray(columns["t_log_ns"]) for parts in held.values() for columns in parts)
-    return sum(len(log) if log[-1] < horizon else int(np.searchsorted(log, horizon)) for log in logs)
-
-
-def _rows(topic: str, order: int, table: pl.DataFrame) -> Iterator[tuple[int, int, int, RecordedMessage]]:
-    names = [c for c in table.columns if c not in _NOW]
-    values = table.select(names).rows() if names else [()] * table.height
-    times = zip(table["t_ns"].to_list(), table["t_log_ns"].to_list(), values, strict=True)
-    for i, (t_ns, log, row) in enumerate(times):
-        yield log, order, i, RecordedMessage(topic, t_ns, log, dict(zip(names, row, strict=True)))

@@ -26,13 +26,9 @@ from .annotations import (
     encode_events,
     identified,
 )
-from .codec import (
-    Chunk,
-    Encoder,
-    check_times,
-    index_of,
-)
+from .codec import check_times, index_of
 from .definitions import full_text
+from .encoder import Chunk, Encoder
 from .errors import MarchaError, UsageError
 from .events import SIDECAR, TABLE, events_text, sidecar, to_events
 from .mcapfile import (
@@ -401,11 +397,13 @@ class Writer:
             out.sequence += len(records)
             self._gather(out, zip(log.tolist(), records, strict=True))
             return
-        rows, at = encoder.rows(arrays, t_ns, log), 0
+        at = 0
         while at < len(log):
             chunk = out.chunk = out.chunk or encoder.chunk(CHUNK_SIZE)
             n = min(len(log) - at, chunk.most - chunk.rows)
-            chunk.append(rows, at, n, out.sequence)
+            rows = slice(at, at + n)
+            columns = {name: values[rows] for name, values in arrays.items()}
+            chunk.encode_into(columns, t_ns[rows], log[rows], out.sequence)
             at += n
             out.sequence += n
             if chunk.rows == chunk.most:

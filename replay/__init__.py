@@ -5,7 +5,7 @@ from .api import replay
 from .attachment import NOT_RAW, ChannelAttachment
 from .calibrations import calibrate, load_calibration, save_calibration
 from .clock import Clock, ManualClock, SystemClock
-from .engine import Engine, ReplayResult, Run
+from .engine import Engine
 from .evaluate import (
     Evaluation,
     RunEvaluation,
@@ -14,13 +14,8 @@ from .evaluate import (
 )
 from .gaps import GapPolicy
 from .metrics import RunView, Truth, nees_bounds
-from .plan import (
-    EstimatorSpec,
-    Plan,
-    PlannedRun,
-    parse_estimator,
-    plan_runs,
-)
+from .plan import Plan, PlannedRun, plan_runs
+from .results import ReplayResult, Run
 from .sinks import RecordingSink, Sink, TableSink
 from .sources import (
     Batch,
@@ -30,6 +25,7 @@ from .sources import (
     Source,
     SourceFailed,
 )
+from .specs import EstimatorSpec, parse_estimator
 from .tuning import Tuned, tune
 
 __all__ = [

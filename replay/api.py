@@ -13,15 +13,11 @@ from ..recording import open as open_recording
 from ..recording.errors import OutputExists, UsageError
 from ..recording.provenance import hash_file
 from .clock import Clock
-from .engine import (
-    Engine,
-    Progress,
-    ReplayResult,
-    Run,
-)
+from .engine import Engine, Progress
 from .evaluate import evaluate, evaluate_run, recording_view
 from .gaps import GapPolicy, Gaps
 from .plan import EstimatorLike, plan_runs
+from .results import ReplayResult, Run
 from .sinks import RecordingSink, Sink, TableSink
 from .sources import RecordingSource, Source, SourceFailed
 

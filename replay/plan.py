@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,79 +29,10 @@ from .attachment import ChannelAttachment, NamedChannels, attach, device_of, ser
 from .calibrations import calibrations_of, usable
 from .messages import AttachedChannel
 from .sources import PlannedChannel, Source
-
-_SPEC = re.compile(
-    r"^(?:(?P<label>[A-Za-z0-9_-]+)=)?(?P<name>[^\[\]=\s]+)(?:\[(?P<params>.*)\])?$", re.DOTALL
-)
-
-
-class EstimatorSpec(msgspec.Struct, frozen=True):
-    """An estimator as the user asks for it: ``label=name[key=value,…]``.
-
-    Attributes
-    ----------
-    name : str
-        Name of a registered estimator.
-    params : dict
-        Parameters that differ from the defaults; ``preset`` names a set of them.
-    label : str
-        Takes the name's place in the run's id.
-    """
-
-    name: str
-    params: dict[str, Any] = {}
-    label: str = ""
-
+from .specs import EstimatorSpec, parse_estimator, split_outside_brackets
 
 EstimatorLike = str | EstimatorSpec | PlainEstimator | Estimator | type
 """What the user may name an estimator by: its name, a specification, an instance or a class."""
-
-
-def parse_estimator(text: str) -> EstimatorSpec:
-    """Read ``name``, ``name[key=value,…]`` or ``label=name[…]``.
-
-    Values are JSON where they can be (numbers, true, false, null, lists), else plain words.
-
-    Raises
-    ------
-    UsageError
-        Where the text has another form.
-    """
-    match = _SPEC.match(text.strip())
-    if match is None:
-        raise UsageError(f"estimator {text!r}: expected name, name[key=value,…] or label=name[key=value,…]")
-    params: dict[str, Any] = {}
-    for part in _split(match["params"] or ""):
-        key, equals, value = part.partition("=")
-        if not equals or not key.strip():
-            raise UsageError(f"estimator {text!r}: {part!r} is not key=value")
-        if key.strip() in params:
-            raise UsageError(f"estimator {text!r}: {key.strip()} is given twice")
-        params[key.strip()] = parse_value(value.strip())
-    return EstimatorSpec(match["name"], params, match["label"] or "")
-
-
-def parse_value(text: str) -> Any:
-    """Return the JSON value that ``text`` is, else the text itself."""
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
-
-
-def _split(text: str, separator: str = ",") -> list[str]:
-    """Split at a separator outside of brackets and quotes."""
-    parts, depth, quoted, start = [], 0, False, 0
-    for i, sign in enumerate(text):
-        if sign == '"':
-            quoted = not quoted
-        elif not quoted:
-            depth += (sign in "[{") - (sign in "]}")
-            if sign == separator and depth == 0:
-                parts.append(text[start:i])
-                start = i + 1
-    parts.append(text[start:])
-    return [p for p in (p.strip() for p in parts) if p]
 
 
 @dataclass(frozen=True)
@@ -257,7 +187,7 @@ def plan_runs(
 
 def _chain(asked: EstimatorLike) -> Sequence[EstimatorLike]:
     """Return the stages of what the user asked for."""
-    return _split(asked, "+") if isinstance(asked, str) else [asked]
+    return split_outside_brackets(asked, "+") if isinstance(asked, str) else [asked]
 
 
 class _Planner:

@@ -25,15 +25,14 @@ from ..algorithms.contract import (
     output_columns,
 )
 from ..recording.errors import Finding, MarchaError
-from ..recording.schemas import SCHEMAS
 from .blocks import Block, Columns, by_columns, joined_by_name
 from .marking import NO_ANNOTATIONS, Marker
 from .merging import AFTER_ALL
 from .messages import MessageBlock, MessageFeed
 from .plan import PlannedRun
+from .result_columns import typed, with_swing_times
 from .rows import RowBlock, RowFeed
 
-_INTEGERS = {"index": np.uint32, "status": np.int8, "service": np.uint16}
 _MESSAGES_A_CALL = 8192
 """Messages that a kernel takes at once: what it reads and writes stays in the processor's cache."""
 
@@ -139,10 +138,10 @@ class Runner:
     def _block(self, output: Output, rows: Columns, keys: IntArray) -> Block:
         """Give the columns of an output their types and note its annotations."""
         data = {
-            name: values if name in TIMES else _typed(output, name, values) for name, values in rows.items()
+            name: values if name in TIMES else typed(output, name, values) for name, values in rows.items()
         }
         if output.schema == "marcha_msgs/msg/Step":
-            data = _with_swing_times(data)
+            data = with_swing_times(data)
         if output.name in self.markers:
             self.markers[output.name].take(data)
         return Block(data, keys)
@@ -446,23 +445,6 @@ class MessageRunner(Runner):
         return blocks
 
 
-def _typed(output: Output, name: str, values: Any) -> Any:
-    """Return a result column in the type of its message's field."""
-    schema = SCHEMAS.get(output.schema)
-    column = (
-        None if schema is None or schema.names else next((c for c in schema.columns if c.name == name), None)
-    )
-    if column is None:
-        return values.astype(np.float64) if values.dtype.kind in "iufb" else values
-    if column.kind == "flag":
-        return values > 0.5 if values.dtype.kind == "f" else values.astype(bool)
-    if column.kind == "time":
-        return values.astype(np.int64)
-    if column.kind in ("mac", "technology", "text"):
-        return values.astype(object) if values.dtype.kind == "U" else values
-    return values.astype(_INTEGERS.get(name, np.float64), copy=False)
-
-
 def warm_up(estimator: Any, blocks: bool) -> None:
     """Let a kernel compile (or load from its cache) before a clock runs; its state stays as it is."""
     if isinstance(estimator, KernelEstimator):
@@ -482,19 +464,6 @@ def warm_up(estimator: Any, blocks: bool) -> None:
     else:
         estimator.step(zeros[0])
     estimator.restore(before)
-
-
-def _with_swing_times(steps: Columns) -> Columns:
-    """Turn the swing's length of a step, which ends at the row's time, into its two times.
-
-    Row kernels know no clock: they state ``swing_s`` instead of ``start_ns`` and ``end_ns``.
-    """
-    if "swing_s" not in steps:
-        return steps
-    t_ns = steps["t_ns"]
-    times = {"start_ns": t_ns - np.round(steps["swing_s"] * 1e9).astype(np.int64), "end_ns": t_ns}
-    rest = {name: values for name, values in steps.items() if name not in ("t_ns", "t_log_ns", "swing_s")}
-    return {"t_ns": t_ns, "t_log_ns": steps["t_log_ns"], **times, **rest}
 
 
 def runner_of(plan: PlannedRun, feed: RowFeed | MessageFeed, blocks: bool) -> Runner:

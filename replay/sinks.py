@@ -13,7 +13,7 @@ from .plan import Plan, PlannedChannel
 
 if TYPE_CHECKING:
     from ..recording import Recording, Writer
-    from .engine import ReplayResult
+    from .results import ReplayResult
 
 
 LEVEL = None

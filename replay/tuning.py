@@ -20,10 +20,11 @@ from ..algorithms import (
 from ..recording import Recording
 from ..recording.errors import UsageError
 from .api import replay as replay_recording
-from .engine import Progress, Run
+from .engine import Progress
 from .evaluate import recording_view, truth_of
 from .metrics import Truth, closure, distance
-from .plan import EstimatorSpec, parse_estimator, parse_value
+from .results import Run
+from .specs import EstimatorSpec, parse_estimator, parse_value
 
 MOST_POINTS = 4096
 """A grid of more points is refused: coordinates one after another, or fewer values."""

@@ -24,9 +24,9 @@ from ..recording import create as create_recording
 from ..recording import open as open_recording
 from ..replay.api import replay
 from ..replay.attachment import NOT_RAW
-from ..replay.engine import Run
-from ..replay.plan import EstimatorSpec
+from ..replay.results import Run
 from ..replay.runs import warm_up
+from ..replay.specs import EstimatorSpec
 from .plan import Job, StudyRecording, StudyTask
 
 #: Points that are kept of a track: enough for a figure, small enough for hundreds of walks.

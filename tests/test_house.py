@@ -127,3 +127,23 @@ def test_nothing_names_a_machine() -> None:
         path = ROOT / name
         if path.suffix in {".py", ".md", ".toml", ".yml", ""} and path.is_file() and len(here) > 3:
             assert here + "/" not in path.read_text(encoding="utf-8", errors="ignore"), name
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_no_file_is_longer_than_five_hundred_lines(path: Path) -> None:
+    lines = len(path.read_text(encoding="utf-8").splitlines())
+    assert lines <= 500, f"{path}: {lines} lines; split it by subject"
+
+
+def test_one_public_name_means_one_thing() -> None:
+    """No two modules give the same name to different classes, registered plug-ins and detectors' Params apart."""
+    registered = {tuple(target.split(":")) for _, _, target in ENTRY_POINTS}
+    places: dict[str, list[str]] = {}
+    for path in SOURCES:
+        module = ".".join(("marcha", *path.relative_to(ROOT).with_suffix("").parts))
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            plugin = isinstance(node, ast.ClassDef) and (module, node.name) in registered
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_") and not plugin:
+                places.setdefault(node.name, []).append(module)
+    del places["Params"]
+    assert {name: where for name, where in places.items() if len(where) > 1} == {}

@@ -8,7 +8,7 @@ import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from marcha.recording import mcapfile, writer
+from marcha.recording import mcapfile, reader, writer
 
 from .recording_samples import imu
 
@@ -90,13 +90,13 @@ def test_few_rows_are_held_whatever_the_length(tmp_path, monkeypatch):
             out.add_table(topic, "sensor_msgs/msg/Imu", imu(60_000))
     rec = mr.open(path)
     held = []
-    emit = rec._emit
+    cut = reader.cut
 
     def spy(tables, horizon, max_rows):
         held.append(sum(len(columns["t_ns"]) for parts in tables.values() for columns in parts))
-        return emit(tables, horizon, max_rows)
+        return cut(tables, horizon, max_rows)
 
-    monkeypatch.setattr(rec, "_emit", spy)
+    monkeypatch.setattr(reader, "cut", spy)
     rows = sum(t.height for w in rec.windows(max_rows=5000) for t in w.tables.values())
     per = (1 << 20) // 355
     assert rows == 120_000

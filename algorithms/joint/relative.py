@@ -8,7 +8,7 @@ import numpy as np
 
 from ..contract import AlgorithmError, Context, FloatArray, Input, Output, Remark
 from ..parameters import meta
-from . import chain
+from . import chain, chain_loop
 from .common import JointEstimator, MergeParams, encoder, imu, mounts
 from .source import JOINT_STATE, NAMED, axis_remarks, set_up_axes
 
@@ -106,8 +106,8 @@ class ChainEstimator(JointEstimator):
     lookahead = 2
     latency = 2
     least = 2
-    run = staticmethod(chain.run)
-    run_end = staticmethod(chain.run_end)
+    run = staticmethod(chain_loop.run)
+    run_end = staticmethod(chain_loop.run_end)
 
     def set_up(self, context: Context) -> None:
         """Write parameters into the state and set ``outputs``."""
@@ -137,7 +137,7 @@ class ChainEstimator(JointEstimator):
         """Write what is known of the joints."""
 
     def outputs_of(self) -> tuple[Output, ...]:
-        """Return the outputs in the order of :func:`.chain.emit`."""
+        """Return the outputs in the order of :func:`.chain_loop.emit`."""
         joints, types = self.joint_names(), self.state["type"][0]
         angles: list[str] = []
         for j, name in enumerate(joints):
