@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-from cyclopts import Parameter
 
 from .console import Heading, Outcome
-from .options import DEFAULT, Common, Force
+from .options import DEFAULT, Common, Force, RecordingOutput
 
 
 def align(
     recording: Path,
     /,
     *,
-    output: Annotated[Path, Parameter(name=("--output", "-o"))],
+    output: RecordingOutput,
     segment: str,
     force: Force = False,
     common: Common = DEFAULT,

@@ -6,9 +6,12 @@ Nothing heavy is imported here or at the top of a command's module: ``marcha --h
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from cyclopts import App, CycloptsError, Group
@@ -23,15 +26,16 @@ from .console import (
 from .errors import (
     DONE,
     FAILED,
-    INTERRUPTED,
     USAGE,
+    Terminated,
     expected,
 )
 from .options import QUIET
 
 EPILOGUE = (
     "Exit codes: 0 done; 1 failed; 2 wrong usage; 3 done, but data was lost or\n"
-    "repaired in a way you should know; 4 a threshold was missed; 130 interrupted."
+    "repaired in a way you should know; 4 a threshold was missed; 130 interrupted (Ctrl-C);\n"
+    "143 ended (SIGTERM)."
 )
 
 RAW = Group("From raw logs", sort_key=1)
@@ -112,6 +116,26 @@ def build(*, overview: bool = False) -> App:
     return app
 
 
+@contextmanager
+def _ending_well() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP unwind the command as Ctrl-C does: nothing half written stays, nothing runs on."""
+
+    def end(number: int, frame: object) -> None:
+        signal.signal(number, signal.SIG_DFL)  # a second one ends it at once
+        raise Terminated(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    names = [n for n in ("SIGTERM", "SIGHUP") if hasattr(signal, n)]
+    before = {n: signal.signal(getattr(signal, n), end) for n in names}
+    try:
+        yield
+    finally:
+        for name, handler in before.items():
+            signal.signal(getattr(signal, name), handler)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run ``marcha`` and return the exit code.
 
@@ -120,6 +144,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv : sequence of str, optional
         Arguments without the program's name; those of the process by default.
     """
+    with _ending_well():
+        return _run(argv)
+
+
+def _run(argv: Sequence[str] | None) -> int:
     tokens = list(sys.argv[1:] if argv is None else argv)
     as_json = "--json" in tokens[: tokens.index("--")] if "--" in tokens else "--json" in tokens
     try:
@@ -141,7 +170,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if known is None:
             raise
         line, code = known
-        if as_json and code != INTERRUPTED:
+        if as_json and not isinstance(error, KeyboardInterrupt):
             emit_json({"error": line, "exit_code": code})
         complain(line)
         return code

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 
 from .console import Heading, Outcome, TextTable, complain
 from .contents import say_losses
-from .options import DEFAULT, Common, Shown, Strings, settings
+from .options import DEFAULT, Common, MaybeRecordingOutput, Shown, Strings, settings
 
 if TYPE_CHECKING:
     from ..recording import Recording
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class Where:
     """Where a change is written, and who makes it."""
 
-    output: Annotated[Path | None, Parameter(name=("--output", "-o"))] = None
+    output: MaybeRecordingOutput = None
     """New recording to write."""
 
     in_place: Annotated[bool, Parameter(name="--in-place", negative="")] = False

@@ -7,12 +7,13 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 from .options import Common, plain
 
 LONGEST = 120
-"""Characters of a cell; longer values (JSON, hashes) are cut, ``--json`` has them whole."""
+"""Characters of a cell that is cut on a terminal (JSON, hashes); pipes and ``--json`` have it whole."""
 
 
 GUTTER = 2
@@ -38,11 +39,14 @@ class TextTable:
         Cells; None is shown as ``–``, a float with four significant digits.
     fold : bool
         On a terminal that is too narrow, show the columns in several tables, each with the first column.
+    cut : bool
+        On a terminal, cut cells that are longer than :data:`LONGEST`.
     """
 
     columns: Sequence[str]
     rows: Sequence[Sequence[Any]]
     fold: bool = False
+    cut: bool = False
 
 
 @dataclass(frozen=True)
@@ -75,30 +79,52 @@ def emit(outcome: Outcome, *, as_json: bool) -> None:
     wide = Console(highlight=False, markup=False, emoji=False, width=10_000)  # a table is never cut to fit
     for part in outcome.lines:
         if isinstance(part, Heading):
-            out.print(part.text, soft_wrap=True)
+            out.print("\n".join(printable(line) for line in part.text.split("\n")), soft_wrap=True)
         elif part.rows:
             pieces = folded(part, out.width) if part.fold and out.is_terminal else [part]
             for k, piece in enumerate(pieces):
                 if k:
                     out.print()
-                wide.print(_grid(piece, colour=out.is_terminal))
+                wide.print(_grid(piece, terminal=out.is_terminal))
 
 
 def emit_json(document: dict[str, Any]) -> None:
     """Print one JSON object on standard output; what is not a number (NaN, infinity) becomes null."""
     import msgspec
 
-    sys.stdout.write(msgspec.json.encode(document, enc_hook=plain).decode() + "\n")
+    try:
+        text = msgspec.json.encode(document, enc_hook=plain)
+    except UnicodeEncodeError:  # a file's name that is no UTF-8
+        text = msgspec.json.encode(_encodable(document), enc_hook=plain)
+    sys.stdout.write(text.decode() + "\n")
+
+
+def _encodable(value: Any) -> Any:
+    """Return a document whose texts are Unicode: bytes of a file's name that are none become escapes."""
+    if isinstance(value, str | Path):
+        return str(value).encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, dict):
+        return {_encodable(k): _encodable(v) for k, v in value.items()}
+    return [_encodable(v) for v in value] if isinstance(value, list | tuple) else value
+
+
+def printable(text: str) -> str:
+    """Return text that does nothing to a terminal but show: what a file says may hold anything."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def complain(line: str) -> None:
     """Write one line on standard error."""
-    sys.stderr.write(f"marcha: {line}\n")
+    sys.stderr.write(f"marcha: {printable(line)}\n")
 
 
 def warn(message: Warning | str, category: type[Warning], *where: object) -> None:
     """Say a warning in one line; takes the place of :func:`warnings.showwarning`."""
-    complain(f"warning: {' '.join(str(message).split())}")
+    from ..recording.errors import one_line
+
+    complain(f"warning: {one_line(str(message))}")
 
 
 def number(value: Any) -> str:
@@ -111,8 +137,7 @@ def number(value: Any) -> str:
         if math.isnan(value):
             return "–"
         return f"{value:.0f}" if abs(value) >= 1e4 and math.isfinite(value) else f"{value:.4g}"
-    text = str(value)
-    return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
+    return printable(str(value))
 
 
 def folded(table: TextTable, width: int) -> list[TextTable]:
@@ -136,17 +161,20 @@ def folded(table: TextTable, width: int) -> list[TextTable]:
     ] or [table]
 
 
-def _grid(table: TextTable, *, colour: bool) -> Any:
+def _grid(table: TextTable, *, terminal: bool) -> Any:
     from rich.table import Table as Grid
     from rich.text import Text
 
-    grid = Grid(box=None, pad_edge=False, padding=(0, GUTTER, 0, 0), header_style="bold" if colour else "")
+    grid = Grid(box=None, pad_edge=False, padding=(0, GUTTER, 0, 0), header_style="bold" if terminal else "")
     for title in table.columns:
         right = title.startswith(">")
         justify: Literal["right", "left"] = "right" if right else "left"
         grid.add_column(Text(title.removeprefix(">")), justify=justify, no_wrap=True, overflow="ignore")
     for row in table.rows:
-        grid.add_row(*(Text(number(cell)) for cell in row))
+        cells = [number(cell) for cell in row]
+        if terminal and table.cut:
+            cells = [c if len(c) <= LONGEST else c[: LONGEST - 1] + "…" for c in cells]
+        grid.add_row(*map(Text, cells))
     return grid
 
 

@@ -51,7 +51,7 @@ def info(path: Path, /, *, common: Common = DEFAULT) -> Outcome:
     for name, values in rec.metadata.items():
         lines += [
             Heading(f"\n{name}"),
-            TextTable(["  key", "value"], [["  " + k, v] for k, v in values.items()]),
+            TextTable(["  key", "value"], [["  " + k, v] for k, v in values.items()], cut=True),
         ]
     if rec.attachments:
         lines += [
@@ -128,9 +128,13 @@ def check(path: Path, /, *, common: Common = DEFAULT) -> Outcome:
     rec = recording.open(path)
     found = [finding_entry(f) for f in examine(rec)]
     imported, lossy = import_report(rec)
-    lines: list[Heading | TextTable] = [
-        Heading(f"{path}: {'nothing is wrong' if not found else 'look at this'}")
-    ]
+    if not found and not imported:
+        said = "nothing is wrong"
+    else:
+        said = "look at this" if found else "the recording is sound; the raw log was not"
+        if not found and not lossy:
+            said = "nothing is wrong; the import made remarks"
+    lines: list[Heading | TextTable] = [Heading(f"{path}: {said}")]
     if found:
         lines.append(finding_table(found))
     if imported:

@@ -25,6 +25,7 @@ from .options import (
     DEFAULT,
     Common,
     Force,
+    RecordingOrFolder,
     Strings,
     settings,
 )
@@ -32,7 +33,7 @@ from .options import (
 
 def convert(
     *paths: Path,
-    output: Annotated[str, Parameter(name=("--output", "-o"))],
+    output: RecordingOrFolder,
     format: str | None = None,
     mapping: Annotated[Path | None, Parameter(name="--map")] = None,
     option: Annotated[Strings, Parameter(name="--set")] = (),
@@ -104,6 +105,7 @@ def _one(
         "output": str(made.output),
         "format": made.format,
         "channels": channels,
+        "also_read": [str(p) for p in made.also_read],
         "report": {**rows, "findings": found},
     }
     lines: list[Heading | TextTable] = [
@@ -119,43 +121,57 @@ def _one(
 
 def _each(paths: tuple[Path, ...], folder: Path, options: dict[str, Any], common: Common) -> Outcome:
     """Convert every input on its own; see :func:`convert`."""
+    from contextlib import ExitStack
+
     from ..ingest.batch import logs as find
+    from ..ingest.convert import unpack_limit
     from ..recording.errors import MarchaError
 
-    logs, skipped = find(paths, format=options["format"])
-    if not logs:
-        raise MarchaError(
-            f"{paths[0]}: holds no log of a known format; marcha formats lists them, --format names one"
-        )
-    names = _names(logs)
-    folder.mkdir(parents=True, exist_ok=True)
-    conversions: list[dict[str, Any]] = []
-    lines: list[Heading | TextTable] = []
-    codes = []
-    for log in logs:
-        output = folder / names[log]
-        try:
-            document, text_lines, code = _one([log], output, options, common)
-        except Exception as error:
-            known = expected(error)
-            if known is None:
-                raise
-            line, code = known
-            complain(line)
-            document, text_lines = {"output": None, "error": line, "exit_code": code}, []
-        conversions.append({"input": str(log), **document})
-        lines += text_lines
-        codes.append(code)
-    lines += [Heading(f"skipped {path}: {reason}") for path, reason in skipped]
+    with ExitStack() as stack:
+        batch = find(paths, stack, format=options["format"], unpack_limit_gb=unpack_limit(options["options"]))
+        if not batch.logs:
+            raise MarchaError(
+                f"{paths[0]}: holds no log of a known format; marcha formats lists them, --format names one"
+            )
+        names = _names(batch.logs)
+        folder.mkdir(parents=True, exist_ok=True)
+        conversions: list[dict[str, Any]] = []
+        lines: list[Heading | TextTable] = []
+        codes = []
+        for log in batch.logs:
+            try:
+                document, said, code = _one([log], folder / names[log], options, common)
+            except Exception as error:
+                known = expected(error)
+                if known is None:
+                    raise
+                line, code = batch.shown(known[0]), known[1]
+                complain(line)
+                document, said = {"output": None, "error": line, "exit_code": code}, []
+            conversions.append({"input": batch.shown(log), **document})
+            lines += said
+            codes.append(code)
+    taken = {path for made in conversions for path in made.get("also_read", ())}
+    skipped = [(batch.shown(path), reason) for path, reason in batch.skipped if str(path) not in taken]
     done = sum(code in (DONE, DEFECTS) for code in codes)
-    lines += [Heading(f"{done} of {len(logs)} converted to {folder}")]
+    lines += [Heading(_summary(done, len(batch.logs), folder, skipped))]
     worst = next((c for c in codes if c not in (DONE, DEFECTS)), DEFECTS if DEFECTS in codes else DONE)
     document = {
         "output": str(folder),
         "conversions": conversions,
-        "skipped": [{"input": str(path), "reason": reason} for path, reason in skipped],
+        "skipped": [{"input": path, "reason": reason} for path, reason in skipped],
     }
     return Outcome(document, lines, FAILED if done == 0 and worst == DONE else worst)
+
+
+def _summary(done: int, logs: int, folder: Path, skipped: list[tuple[str, str]]) -> str:
+    """Return what became of the files: converted, failed, and skipped ones by name."""
+    said = f"{done} of {logs} logs converted to {folder}"
+    if done < logs:
+        said += f"; {logs - done} failed"
+    if skipped:
+        said += f"; {len(skipped)} other files skipped:"
+    return "\n".join([said, *(f"  {path}: {reason}" for path, reason in skipped)])
 
 
 def _names(logs: list[Path]) -> dict[Path, str]:

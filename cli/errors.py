@@ -7,16 +7,28 @@ import errno
 DONE, FAILED, USAGE, DEFECTS, THRESHOLD, INTERRUPTED = 0, 1, 2, 3, 4, 130
 
 
+class Terminated(KeyboardInterrupt):
+    """The process was asked to end by a signal."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.exit_code = 128 + number
+
+
 def expected(error: BaseException) -> tuple[str, int] | None:
     """Return the one line and the exit code of an expected failure, None where it is a bug.
 
     Expected are :class:`MarchaError` (its own exit code), :class:`AlgorithmError` (the call is wrong: 2), an
     ``OSError`` that names a path or says that the disk is full, and the keyboard.
     """
+    if isinstance(error, Terminated):
+        return "ended by a signal; nothing was left half written", error.exit_code
     if isinstance(error, KeyboardInterrupt):
         return "interrupted; nothing was left half written", INTERRUPTED
     if isinstance(error, OSError):
         return _operating_system(error)
+    if isinstance(error, MemoryError):
+        return "out of memory; nothing was left half written", FAILED
     from ..algorithms.contract import AlgorithmError
     from ..recording.errors import MarchaError
 

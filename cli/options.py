@@ -27,9 +27,23 @@ class Common:
 
 DEFAULT = Common()
 
+
+def _named_mcap(kind: object, path: Path | str | None) -> None:
+    """Refuse a recording by another name: ``-o y.txt`` would write what no text editor can read."""
+    if path is None or str(path).endswith(("/", "\\")) or Path(path).is_dir():
+        return
+    if Path(path).suffix.lower() != ".mcap":
+        raise ValueError(
+            f"a recording's name ends in .mcap; give {Path(path).stem}.mcap, or a folder with a /"
+        )
+
+
 Force = Annotated[bool, Parameter(name="--force", negative="")]
 Output = Annotated[Path, Parameter(name=("--output", "-o"))]
 MaybeOutput = Annotated[Path | None, Parameter(name=("--output", "-o"))]
+RecordingOutput = Annotated[Path, Parameter(name=("--output", "-o"), validator=_named_mcap)]
+MaybeRecordingOutput = Annotated[Path | None, Parameter(name=("--output", "-o"), validator=_named_mcap)]
+RecordingOrFolder = Annotated[str, Parameter(name=("--output", "-o"), validator=_named_mcap)]
 QUIET = Parameter(negative="", show_default=False)
 """What holds for every parameter: no ``--no-…`` twin, and a default is said only where :data:`Shown`."""
 

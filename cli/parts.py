@@ -9,14 +9,14 @@ from cyclopts import Parameter
 
 from .console import Heading, Outcome
 from .contents import say_losses
-from .options import DEFAULT, Common, Force, Output, Strings, instant, span_ns
+from .options import DEFAULT, Common, Force, RecordingOutput, Strings, instant, span_ns
 
 
 def cut(
     path: Path,
     /,
     *,
-    output: Output,
+    output: RecordingOutput,
     start: Annotated[str | None, Parameter(name="--start")] = None,
     end: Annotated[str | None, Parameter(name="--end")] = None,
     annotation: Annotated[str | None, Parameter(name="--annotation")] = None,
@@ -62,7 +62,7 @@ def cut(
 
 def merge(
     *paths: Path,
-    output: Output,
+    output: RecordingOutput,
     offset: Annotated[Strings, Parameter(name="--offset", allow_leading_hyphen=True)] = (),
     prefix: Annotated[Strings, Parameter(name="--prefix")] = (),
     force: Force = False,
@@ -101,7 +101,7 @@ def anonymize(
     path: Path,
     /,
     *,
-    output: Output,
+    output: RecordingOutput,
     keep_fixes: Annotated[bool, Parameter(name="--keep-fixes", negative="")] = False,
     force: Force = False,
     common: Common = DEFAULT,

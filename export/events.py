@@ -12,6 +12,7 @@ from ..recording.annotations import COLUMNS as ANNOTATIONS
 from ..recording.annotations import FIELDS
 from ..recording.errors import MarchaError
 from ..recording.events import COLUMNS, events_text, sidecar, to_events
+from ..recording.files import read_small
 
 __all__ = ["ANNOTATIONS", "COLUMNS", "events_text", "read_events", "sidecar", "to_events"]
 
@@ -124,10 +125,7 @@ def _confidence(path: Path, cells: pl.DataFrame) -> pl.Series:
 
 
 def _cells(path: Path) -> pl.DataFrame:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise MarchaError(f"{path}: cannot read: {error.strerror or error}") from None
+    data = read_small(path)
     if not data.strip():
         raise MarchaError(f"{path}: is empty; needs a header line and one row an annotation")
     try:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import lzma
 import shutil
 import stat
+import struct
 import zipfile
+import zlib
 from pathlib import Path, PurePosixPath
 
 from ..recording.errors import MarchaError
 
 UNPACK_LIMIT_GB = 2.0
 """Total that an archive may unpack to, unless an option raises it."""
+DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, RuntimeError, EOFError, ValueError)
+"""What :mod:`zipfile` raises on archives that are damaged, or packed in a way that it does not know."""
 MEMBERS, NAME_BYTES = 10_000, 200
 """Most members, and bytes of one part of a name."""
 
@@ -60,7 +65,7 @@ def unpack(path: Path, folder: Path, limit_gb: float = UNPACK_LIMIT_GB) -> None:
                         if done > limit:
                             raise MarchaError(_too_large(path, done, limit_gb))
                         out.write(chunk)
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, RuntimeError, NotImplementedError, EOFError) as error:
+    except DAMAGED as error:
         shutil.rmtree(folder, ignore_errors=True)
         raise MarchaError(f"{path}: the zip archive cannot be unpacked: {error}") from error
     except OSError as error:

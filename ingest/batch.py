@@ -1,58 +1,98 @@
-"""Which logs are meant when a user names files and folders of logs."""
+"""Which logs are meant when a user names files, folders and archives of logs."""
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from ..recording.errors import MarchaError
 from . import registry
+from .archive import UNPACK_LIMIT_GB, is_zip, unpack
 
 
-def logs(paths: Sequence[Path], *, format: str | None = None) -> tuple[list[Path], list[tuple[Path, str]]]:
+class Batch(NamedTuple):
+    """Logs that each become one recording.
+
+    Attributes
+    ----------
+    logs : list of Path
+        In the order given, files of a folder by name.
+    skipped : list of (Path, str)
+        Files of folders and archives that are left out, and why.
+    archives : dict of Path to Path
+        Folder into which an archive was unpacked, to the archive.
+    """
+
+    logs: list[Path]
+    skipped: list[tuple[Path, str]]
+    archives: dict[Path, Path]
+
+    def shown(self, text: object) -> str:
+        """Return a path, or a message that names one, as the user knows it: inside its archive."""
+        said = str(text)
+        for folder, archive in self.archives.items():
+            said = said.replace(str(folder), str(archive))
+        return said
+
+
+def logs(
+    paths: Sequence[Path],
+    stack: contextlib.ExitStack,
+    *,
+    format: str | None = None,
+    unpack_limit_gb: float = UNPACK_LIMIT_GB,
+) -> Batch:
     """Return every log that ``paths`` stand for, each to become one recording.
 
     A file stands for itself, whatever is in it: what is wrong is said when it is converted. A folder
     that is one log as a whole (a phone's export) stands for itself; any other folder stands for every file
-    in it and below it whose content is recognised.
+    in it and below it whose content is recognised. A zip archive is a folder.
 
     Parameters
     ----------
     paths : sequence of Path
-        Files and folders.
+        Files, folders and archives.
+    stack : contextlib.ExitStack
+        Keeps what archives were unpacked to until it is closed.
     format : str, optional
         Take only this format from folders.
-
-    Returns
-    -------
-    list of Path
-        The logs, in the order given, files of a folder by name.
-    list of (Path, str)
-        Files of folders that are left out, and why.
+    unpack_limit_gb : float
+        Most that an archive may unpack to (GB).
 
     Raises
     ------
     MarchaError
-        A path is not there.
+        A path is not there, or an archive is not to be trusted.
     """
     found: list[Path] = []
     skipped: list[tuple[Path, str]] = []
+    archives: dict[Path, Path] = {}
     for path in paths:
         if not path.exists():
             raise MarchaError(f"{path}: no such file or folder")
-        if not path.is_dir() or _names(path, format):
+        folder = path
+        if path.is_file() and is_zip(path):
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="marcha-")))
+            unpack(path, folder, unpack_limit_gb)
+            archives[folder] = path
+        if not folder.is_dir() or _names(folder, format):
             found.append(path)
             continue
-        for file in sorted(p for p in path.rglob("*") if p.is_file()):
-            if any(part.startswith(".") for part in file.relative_to(path).parts):
+        inside = []
+        for file in sorted(p for p in folder.rglob("*") if p.is_file()):
+            if any(part.startswith(".") or part == "__MACOSX" for part in file.relative_to(folder).parts):
                 continue
             if _names(file, format):
-                found.append(file)
+                inside.append(file)
             else:
                 skipped.append((file, f"not {format}" if format else "no known format"))
+        found += inside if len(inside) > 1 or folder == path else [path]
     sides = {(log.parent, f"{log.stem}.truth") for log in found}  # they come along with their log
     skipped = [(p, why) for p, why in skipped if (p.parent, p.name[: p.name.find(".truth") + 6]) not in sides]
-    return list(dict.fromkeys(found)), skipped
+    return Batch(list(dict.fromkeys(found)), skipped, archives)
 
 
 def _names(path: Path, format: str | None) -> list[str]:

@@ -13,7 +13,7 @@ import polars as pl
 from ..recording.errors import MarchaError
 from .contract import ReportBuilder
 from .mapping import TextLayout
-from .text import BOM, read_blocks, shown
+from .text import BLOCK_BYTES, BOM, read_blocks, shown
 
 
 class Cells:
@@ -80,13 +80,13 @@ class Cells:
     def _blocks(self) -> Iterator[tuple[bytes, int]]:
         """Yield blocks with LF line ends and one-byte separators, and their number of physical lines."""
         wide = self._layout.encoding.lower().replace("_", "-").startswith(("utf-16", "utf-32"))
-        for k, (piece, _) in enumerate(read_blocks(self.path, 1 << 62) if wide else read_blocks(self.path)):
+        for k, (piece, _) in enumerate(read_blocks(self.path, None if wide else BLOCK_BYTES)):
             if not piece and k:
                 continue
             if self._layout.encoding.lower() not in ("utf-8", "ascii"):
                 try:
                     piece = piece.decode(self._layout.encoding).encode()
-                except (LookupError, UnicodeDecodeError) as error:
+                except (LookupError, UnicodeError) as error:
                     raise MarchaError(
                         f"{self.path}: layout.encoding {self._layout.encoding}: {error}"
                     ) from error
@@ -105,7 +105,12 @@ class Cells:
 
     def _split(self, line: bytes) -> list[str]:
         text = line.decode("utf-8", "replace")
-        return next(csv.reader([text], delimiter=self._separator.decode()), [])
+        try:
+            return next(csv.reader([text], delimiter=self._separator.decode()), [])
+        except csv.Error as error:
+            raise MarchaError(
+                f"{self.path}: {shown(line)}: {error}; repair the line, or see layout.separator"
+            ) from None
 
     def _parse(
         self, block: bytes, first_line: int, columns: list[int], report: ReportBuilder

@@ -17,6 +17,7 @@ from .cells import Cells
 from .contract import HEAD_BYTES, ReportBuilder
 from .mapping import TextLayout
 from .text import read_blocks
+from .timestamps import MOST_NS
 
 PREAMBLE_LINES = 200
 """A header stands in one of so many first lines."""
@@ -213,7 +214,7 @@ def careful_block(
             columns[name] = block[place].str.strip_chars().cast(pl.Int64, strict=False)
             if not columns[name].null_count():
                 continue
-            columns[name] = _numbers(block[place]).round().cast(pl.Int64)
+            columns[name] = _numbers(block[place]).round().cast(pl.Int64, strict=False)
             continue
         value = _numbers(block[place])
         columns[name] = value.fill_null(math.nan)
@@ -247,6 +248,27 @@ def careful_block(
                 subject=f"{name} unreadable",
             )
     return pl.DataFrame(columns)
+
+
+def with_ticks(
+    frame: pl.DataFrame, name: str, factor: float, report: ReportBuilder, limit: float = MOST_NS
+) -> pl.DataFrame:
+    """Return the rows with ``t`` (Int64): the column ``name`` times ``factor``, rounded.
+
+    Rows whose time no clock can say are dropped as ``bad_row``.
+    """
+    t = frame[name] * factor
+    far = t.abs() > limit
+    if far.any():
+        at = int(far.arg_true()[0])
+        report.drop(
+            "bad_row",
+            f"{name}: {frame[name][at]:g} is beyond any clock; row dropped",
+            count=int(far.sum()),
+            line=frame["line"][at],
+        )
+        frame, t = frame.filter(~far), t.filter(~far)
+    return frame.with_columns(t=t.round().cast(pl.Int64))
 
 
 def _numbers(text: pl.Series) -> pl.Series:

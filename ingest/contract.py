@@ -237,6 +237,8 @@ class Import:
         completed while the blocks are read.
     attachments : list of SourceAttachment
         Same rule.
+    also_read : sequence of Path
+        Files beside the sources that are read with them (a table of footprints, of anchors).
     """
 
     def __init__(
@@ -247,10 +249,12 @@ class Import:
         report: ReportBuilder,
         metadata: dict[str, dict[str, str]] | None = None,
         attachments: list[SourceAttachment] | None = None,
+        also_read: Sequence[Path] = (),
     ) -> None:
         self.channels = tuple(channels)
         self.metadata = metadata if metadata is not None else {}
         self.attachments = attachments if attachments is not None else []
+        self.also_read = tuple(also_read)
         self._blocks = blocks
         self._builder = report
         self._done = False

@@ -13,6 +13,7 @@ import polars as pl
 
 from .. import recording as mr
 from ..recording.errors import MarchaError, OutputExists, UsageError
+from ..recording.files import as_unicode
 from ..recording.provenance import provenance
 from ..recording.threads import Prefetch, helpers
 from . import registry
@@ -42,12 +43,16 @@ class ConvertedChannel(msgspec.Struct, frozen=True):
 
 
 class Converted(msgspec.Struct, frozen=True):
-    """What :func:`convert` did, with the keys of ``marcha convert --json``."""
+    """What :func:`convert` did, with the keys of ``marcha convert --json``.
+
+    ``also_read`` are files beside the sources that were read with them: truth, footprints, anchors.
+    """
 
     output: str
     format: str
     channels: list[ConvertedChannel]
     report: Report
+    also_read: list[str] = []
 
 
 def convert(
@@ -109,14 +114,16 @@ def convert(
     if out.exists() and not overwrite:
         raise OutputExists(out)
     with contextlib.ExitStack() as stack:
-        found = registry.choose(sources, format, stack, mapped=mapped, unpack_limit_gb=_limit(options or {}))
+        found = registry.choose(
+            sources, format, stack, mapped=mapped, unpack_limit_gb=unpack_limit(options or {})
+        )
         settings = registry.share_options(found, chosen)
         truths = [read_truth(source.files[0]) for source in found]
         facts = {
             "importer": ", ".join(dict.fromkeys(r.importer.name for r, _ in found)),
             "importer_version": ", ".join(dict.fromkeys(r.source for r, _ in found)),
             "options": chosen,
-            "given": ", ".join(p.name for p in sources),
+            "given": ", ".join(as_unicode(p.name) for p in sources),
         }
         read = [p for (_, files), truth in zip(found, truths, strict=True) for p in _read(files, truth)]
         origin = stack.enter_context(helpers("hash", 1)).submit(provenance, read, **facts)
@@ -137,7 +144,7 @@ def convert(
         except OSError as error:
             where = error.filename or out
             raise MarchaError(f"{where}: {error.strerror or error}; nothing was written to {out}") from error
-    return Converted(str(out), facts["importer"], written.channels(), report)
+    return Converted(str(out), facts["importer"], written.channels(), report, merged.also_read)
 
 
 class _Merged:
@@ -149,6 +156,7 @@ class _Merged:
         self._records: dict[str, dict[str, str]] = {}
         self._clocks: dict[str, str] = {}
         self.attachments: list[SourceAttachment] = []
+        self.also_read: list[str] = []
 
     def add(
         self,
@@ -159,7 +167,8 @@ class _Merged:
         written: _Writer,
     ) -> None:
         """Stream one source into the recording."""
-        name = source.files[0].name
+        name = as_unicode(source.files[0].name)
+        self.also_read += [str(p) for p in (*imported.also_read, *(truth.files if truth else ()))]
         written.begin(options, name, len(self._reports))
         for spec in imported.channels:
             written.declare(spec)
@@ -269,7 +278,7 @@ class _Writer:
         ]
 
 
-def _limit(chosen: Mapping[str, Any]) -> float:
+def unpack_limit(chosen: Mapping[str, Any]) -> float:
     """Return how much an archive may unpack to (GB): needed before the format is known."""
     value = chosen.get("unpack_limit_gb", UNPACK_LIMIT_GB)
     try:
@@ -326,4 +335,4 @@ def _files(paths: Sequence[Path]) -> Iterator[tuple[str, Path]]:
 
 def _raw(paths: Sequence[Path]) -> Iterator[SourceAttachment]:
     for name, path in _files(paths):
-        yield SourceAttachment(f"source/{name}", path.read_bytes(), "application/octet-stream")
+        yield SourceAttachment(f"source/{as_unicode(name)}", path.read_bytes(), "application/octet-stream")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Literal
 
 import msgspec
 
 from ..recording import SCHEMAS
 from ..recording.errors import MarchaError, UsageError
+from ..recording.files import read_toml
 from ..recording.schemas import Column
 from .units import conversion
 
@@ -188,20 +189,9 @@ def read_mapping(path: Path) -> Mapping:
     MarchaError
         One line that names the file and the TOML key.
     """
-    try:
-        mapping = msgspec.toml.decode(path.read_bytes(), type=Mapping)
-    except FileNotFoundError as error:
-        raise MarchaError(f"{path}: no such mapping file") from error
-    except OSError as error:
-        raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except msgspec.ValidationError as error:
-        said, _, where = str(error).partition(" - at `$")
-        key = where.rstrip("`").lstrip(".") or "top level"
-        if (choices := _choices(key)) and said.startswith("Invalid enum"):
-            said += f"; one of {', '.join(choices)}"
-        raise MarchaError(f"{path}: {key}: {said}") from error
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise MarchaError(f"{path}: not TOML: {error}") from error
+    if not path.exists():
+        raise MarchaError(f"{path}: no such mapping file")
+    mapping: Mapping = read_toml(path, Mapping)
     time = mapping.time
     if time.column is None and time.rate_hz is None:
         raise MarchaError(f"{path}: time: give time.column, time.rate_hz, or both for a counter of samples")
@@ -223,8 +213,8 @@ def read_mapping(path: Path) -> Mapping:
 def mapping_format(path: Path) -> str:
     """Return the format that a mapping file speaks of: ``exo-csv`` where it names segments, else ``table``."""
     try:
-        document = msgspec.toml.decode(path.read_bytes())
-    except (OSError, msgspec.DecodeError, UnicodeDecodeError):
+        document = read_toml(path)
+    except MarchaError:
         return "table"  # reading it will say what is wrong
     return "exo-csv" if "segment" in document and "topic" not in document else "table"
 
@@ -290,16 +280,6 @@ def targets(path: Path, mapping: Mapping, index: int, topic: Topic) -> list[Targ
                 f"{where}.columns: {lacking} is missing beside {have[0]}; give a column or a constant"
             )
     return found
-
-
-def _choices(key: str) -> tuple[str, ...]:
-    """Return the words that a key of the mapping may have; nothing where it is no choice."""
-    kind: Any = Mapping
-    for part in key.split("."):
-        if not (isinstance(kind, type) and issubclass(kind, msgspec.Struct)):
-            return ()
-        kind = {f.encode_name: f.type for f in msgspec.structs.fields(kind)}.get(part)
-    return get_args(kind) if get_origin(kind) is Literal else ()
 
 
 def _column(name: str, columns: tuple[Column, ...], named: bool) -> Column | None:

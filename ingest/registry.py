@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ..recording.errors import MarchaError, UsageError
+from ..recording.files import require_regular
 from .archive import UNPACK_LIMIT_GB, is_zip, unpack
 from .contract import HEAD_BYTES, CommonOptions, Importer
 from .truth import is_side_file
@@ -275,6 +276,7 @@ def _resolve(
     """Return (format, file or folder) of everything that one input holds."""
     if not path.exists():
         raise MarchaError(f"{path}: no such file or folder")
+    require_regular(path)
     folders = wanted is not None and getattr(wanted.importer, "folders", False)
     archive = path.is_file() and is_zip(path)
     # What a member stores uncompressed stands in the archive as it is: it must not be taken for the log itself.
@@ -309,7 +311,7 @@ def _resolve(
         some = ", ".join(f"{p.relative_to(folder)} ({n})" for n, p in inside[:4])
         raise MarchaError(
             f"{path}: holds {len(inside)} recordings: {some}{' …' if len(inside) > 4 else ''}; "
-            "convert them one by one"
+            "convert them one by one, or each to a recording of its own with -o FOLDER/"
         )
     return inside
 

@@ -52,10 +52,10 @@ def start_of(path: Path, size: int = 4096) -> bytes:
         raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def read_blocks(path: Path, size: int = BLOCK_BYTES) -> Iterator[tuple[bytes, bool]]:
+def read_blocks(path: Path, size: int | None = BLOCK_BYTES) -> Iterator[tuple[bytes, bool]]:
     """Yield pieces of a file cut at line ends, and whether a piece is the last.
 
-    A file of lines ended by a lone CR is one piece.
+    A file of lines ended by a lone CR is one piece, and so is any file without a ``size``.
 
     Raises
     ------
@@ -64,15 +64,14 @@ def read_blocks(path: Path, size: int = BLOCK_BYTES) -> Iterator[tuple[bytes, bo
     """
     try:
         with path.open("rb") as f:
-            rest = b""
-            while data := f.read(size):
-                cut = data.rfind(b"\n") + 1
-                if not cut:
-                    rest += data
-                    continue
-                piece, rest = rest + data[:cut], data[cut:]
-                yield piece, False
-            yield rest, True
+            rest: list[bytes] = []
+            while data := f.read(-1 if size is None else size):
+                cut = 0 if size is None else data.rfind(b"\n") + 1
+                if cut:
+                    yield b"".join((*rest, data[:cut])), False
+                    rest.clear()
+                rest.append(data[cut:])
+            yield b"".join(rest), True
     except OSError as error:
         raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
 

@@ -12,6 +12,8 @@ from .contract import ReportBuilder
 
 Int64Array = NDArray[np.int64]
 
+#: Times beyond this (ns) would not fit 64 bits where a clock is moved: what reads them leaves their rows out.
+MOST_NS = 4 * 10**18
 #: A run of fewer rows whose time stands back is a slip of those rows; a longer one is a clock set anew.
 SLIP_ROWS = 20
 #: Intervals longer than this many nominal ones miss a row; longer than LONG_GAP ones, the source lost data.

@@ -12,7 +12,6 @@ the foot is still; it becomes ``/reference/pose``, ``/reference/velocity`` and `
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +19,7 @@ import msgspec
 import polars as pl
 
 from ..recording.errors import MarchaError
+from ..recording.files import read_toml
 from .contract import ChannelSpec
 
 POSE = ("pos_x", "pos_y", "pos_z", "quat_w", "quat_x", "quat_y", "quat_z")
@@ -119,10 +119,9 @@ def as_text(value: object) -> str:
 
 
 def _facts(file: Path) -> dict[str, str]:
-    try:
-        facts = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise MarchaError(f"{file}: not a readable TOML file: {error}; repair or remove it") from error
+    facts = read_toml(file)
+    if not isinstance(facts, dict):
+        raise MarchaError(f"{file}: holds no table of facts; repair or remove it")
     return dict(_flat("", facts))
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from .checksum import crc32
 from .codec import PREFIX, Messages
 from .errors import MarchaError
+from .files import require_regular
 
 MAX_CHUNK = 1 << 32
 """A chunk that claims more bytes than this is broken."""
@@ -67,6 +68,7 @@ class FileReader:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        require_regular(path)
         try:
             self._file: IO[bytes] = path.open("rb")
             self.size = self._file.seek(0, 2)

@@ -6,6 +6,23 @@ from pathlib import Path
 
 import msgspec
 
+MOST_CHARACTERS = 1000
+"""Of a message; the middle of a longer one is left out."""
+
+
+def one_line(text: str, most: int = MOST_CHARACTERS) -> str:
+    """Return text as one printable line of bounded length, whatever it quotes from a file.
+
+    White space becomes single blanks; other characters that a terminal would act on become escapes.
+    """
+    text = " ".join(text.split()) if len(text) <= 4 * most else text
+    if len(text) > most:
+        text = f"{text[: most * 2 // 3]} … {text[-most // 4 :]}"
+    text = " ".join(text.split())
+    if not text.isprintable():
+        text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return text if len(text) <= 1.2 * most else f"{text[:most]} …"
+
 
 class MarchaError(Exception):
     """An expected failure (bad input, existing output): one line that names file, rule, value and remedy.
@@ -14,6 +31,9 @@ class MarchaError(Exception):
     """
 
     exit_code = 1
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(one_line(str(message)))
 
 
 class UsageError(MarchaError):
@@ -48,3 +68,7 @@ class Finding(msgspec.Struct, frozen=True):
     count: int
     first_line: int | None = None
     detail: str = ""
+
+    def __post_init__(self) -> None:
+        if len(self.detail) > MOST_CHARACTERS or not self.detail.isprintable():
+            msgspec.structs.force_setattr(self, "detail", one_line(self.detail))

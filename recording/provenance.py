@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 from .errors import MarchaError
+from .files import as_unicode
 from .mcapfile import library_name
 
 RECORD = "provenance"
@@ -57,7 +58,7 @@ def hash_file(path: Path | str) -> str:
 
 def source_file(path: Path | str) -> SourceFile:
     """Return name, size and hash of a file."""
-    return SourceFile(Path(path).name, Path(path).stat().st_size, hash_file(path))
+    return SourceFile(as_unicode(Path(path).name), Path(path).stat().st_size, hash_file(path))
 
 
 def provenance(sources: Iterable[Path | str], **facts: Any) -> dict[str, str]:

@@ -18,7 +18,8 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 from ..algorithms import available
-from ..recording import UsageError
+from ..recording import MarchaError, UsageError
+from ..recording.files import parse_toml, read_small
 
 NonNegative = Annotated[int, msgspec.Meta(ge=0)]
 _PACKAGE = __name__.rpartition(".")[0]
@@ -320,15 +321,15 @@ def load(config: str | Path | StudyConfig) -> tuple[StudyConfig, Path | None]:
         return check(config, "the configuration"), None
     path = Path(config)
     if path.is_file():
-        data, base = path.read_bytes(), path.resolve().parent
+        data, base = read_small(path), path.resolve().parent
     elif path.name == str(config) and str(config) in presets():
         data, base = (resources.files(_PACKAGE) / "presets" / f"{config}.toml").read_bytes(), None
     else:
         raise UsageError(f"{config}: no such file, and not a preset; presets are {', '.join(presets())}")
     try:
-        parsed = msgspec.toml.decode(data, type=StudyConfig)
-    except msgspec.DecodeError as error:  # ValidationError is a DecodeError
-        raise UsageError(f"{config}: {error}") from None
+        parsed: StudyConfig = parse_toml(data, str(config), StudyConfig)
+    except MarchaError as error:
+        raise UsageError(str(error)) from None
     return check(parsed, str(config)), base
 
 

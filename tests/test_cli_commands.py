@@ -104,7 +104,7 @@ def test_simulate_gives_the_same_bytes_for_the_same_seed(tmp_path: Path) -> None
 
 def test_convert_has_the_agreed_keys(folder: Path, tmp_path: Path) -> None:
     document = marcha("convert", raw(folder), "-o", tmp_path / "a.mcap", "--json").document
-    assert document.keys() == {"output", "format", "channels", "report"}
+    assert document.keys() == {"output", "format", "channels", "report", "also_read"}
     assert document["channels"][0].keys() == CHANNEL
     report = document["report"]
     assert report.keys() == {"rows_read", "rows_kept", "rows_repaired", "rows_dropped", "findings"}

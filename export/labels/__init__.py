@@ -10,7 +10,8 @@ import polars as pl
 
 from ...recording import Recording
 from ...recording.changes import check_inside
-from ...recording.errors import MarchaError, UsageError
+from ...recording.errors import UsageError
+from ...recording.files import read_small
 from ..events import read_events
 from . import audacity, c3d, elan, textgrid
 from .side import annotations_of
@@ -61,10 +62,7 @@ def read_labels(
     UsageError
         An unknown format.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise MarchaError(f"{path}: cannot read: {error.strerror or error}") from None
+    data = read_small(path)
     if format is not None and format not in (*FORMATS, TABLE):
         raise UsageError(f"label format {format!r}: not known; there are {', '.join((*FORMATS, TABLE))}")
     name = format or next((n for n, m in FORMATS.items() if m.sniff(path, data[:4096])), TABLE)

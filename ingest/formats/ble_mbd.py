@@ -68,7 +68,8 @@ class BleMbd:
         if not files:
             raise MarchaError(f"{paths[0]}: the folder has no .mbd file")
         report = ReportBuilder()
-        devices = _devices(files[0], options.devices)
+        device_file = _device_file(files[0], options.devices)
+        devices = _devices(device_file)
         parts = [_parse(f, report) for f in files]
         static = [len(p.columns) == 4 for p in parts]
         if any(static) != all(static):
@@ -118,6 +119,7 @@ class BleMbd:
                 },
                 "plan": {"handedness": "right", "frame": "x, y, z of the optical system, m"},
             },
+            also_read=[device_file],
             attachments=[
                 anchor_table(
                     {"mac": mac, "technology": "ble", "x": x, "y": y, "z": z, "name": name}
@@ -240,17 +242,20 @@ def _apart(
     return kept, tables
 
 
-def _devices(log: Path, named: str | None) -> dict[str, tuple[list[float], str]]:
-    """Return address to position and name of the receivers."""
+def _device_file(log: Path, named: str | None) -> Path:
+    """Return the table of receivers that belongs to a log."""
     if named is not None:
-        file = Path(named)
-    else:
-        found = next((f for d in (log.parent, log.parent.parent) for f in [sorted(d.glob("*.dev"))] if f), [])
-        if len(found) != 1:
-            raise UsageError(
-                f"{log}: {len(found) or 'no'} table of receivers (.dev) beside it; name it with devices=FILE.dev"
-            )
-        file = found[0]
+        return Path(named)
+    found = next((f for d in (log.parent, log.parent.parent) for f in [sorted(d.glob("*.dev"))] if f), [])
+    if len(found) != 1:
+        raise UsageError(
+            f"{log}: {len(found) or 'no'} table of receivers (.dev) beside it; name it with devices=FILE.dev"
+        )
+    return found[0]
+
+
+def _devices(file: Path) -> dict[str, tuple[list[float], str]]:
+    """Return address to position and name of the receivers."""
     match = re.search(r"Dongles:\s*(\{.*?\})\s*(Beacons:|$)", read_text(file), re.DOTALL)
     try:
         table = json.loads(match[1]) if match else None

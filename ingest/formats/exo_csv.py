@@ -15,6 +15,7 @@ import numpy as np
 import polars as pl
 
 from ...recording.errors import MarchaError
+from ...recording.files import read_toml
 from ..contract import CommonOptions, Import, ReportBuilder
 from ..leg import IMU, JOINTS, MAG, FloatArray
 from ..legchecks import unwrapped
@@ -122,8 +123,8 @@ class ExoCsv:
         if path.suffix.lower() not in (".csv", ".txt", ".tsv") or not beside.is_file():
             return 0.0
         try:
-            mapping = msgspec.toml.decode(beside.read_bytes(), type=ExoMapping)
-        except (OSError, msgspec.MsgspecError, UnicodeDecodeError):
+            mapping: ExoMapping = read_toml(beside, ExoMapping)
+        except MarchaError:
             return 0.0
         first = head[:4096].decode("utf-8", "replace")
         return 0.9 if any((s.prefix or name) in first for name, s in mapping.segment.items()) else 0.0
@@ -147,23 +148,16 @@ class ExoCsv:
                 "device": {"clock": mapping.time.clock, **mapping.device},
                 "mapping": {"file": map_file.name, "toml": map_file.read_text(encoding="utf-8")},
             },
+            also_read=[map_file],
         )
 
 
 def _read_mapping(map_file: Path, path: Path) -> ExoMapping:
-    try:
-        mapping = msgspec.toml.decode(map_file.read_bytes(), type=ExoMapping)
-    except FileNotFoundError as error:
+    if not map_file.exists():
         raise MarchaError(
             f"{map_file}: no such mapping file; {path.name} needs one that names segments and units (--map)"
-        ) from error
-    except OSError as error:
-        raise MarchaError(f"{map_file}: cannot be read: {error.strerror or error}") from error
-    except msgspec.ValidationError as error:
-        reason, _, where = str(error).partition(" - at `$")
-        raise MarchaError(f"{map_file}: {where.rstrip('`').lstrip('.') or 'top level'}: {reason}") from error
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise MarchaError(f"{map_file}: not TOML: {error}") from error
+        )
+    mapping: ExoMapping = read_toml(map_file, ExoMapping)
     if not mapping.segment:
         raise MarchaError(f"{map_file}: segment: at least one segment is needed")
     for name, joint in mapping.joint.items():

@@ -31,6 +31,7 @@ from ..columns import (
     find_header,
     float_blocks,
     require_header,
+    with_ticks,
 )
 from ..contract import (
     ChannelSpec,
@@ -154,6 +155,7 @@ class SensorConnectCsv:
             blocks=_with_footprints(tables(path, frames, plans, clock, report), footprints, truth, report),
             report=report,
             metadata=metadata,
+            also_read=[truth] if truth is not None else [],
         )
 
 
@@ -236,7 +238,7 @@ def _frames(
         if angles:
             quat = _north_west_up(*(frame[a].to_numpy() for a in angles))
             frame = frame.with_columns(*(pl.Series(n, q) for n, q in zip(QUAT, quat, strict=True)))
-        yield frame.with_columns(t=(pl.col("Time") * 1e9).round().cast(pl.Int64)).drop("Time")
+        yield with_ticks(frame, "Time", 1e9, report).drop("Time")
 
 
 def _north_west_up(roll: np.ndarray, pitch: np.ndarray, yaw: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -29,7 +29,7 @@ from ..mapping import (
     schema_name,
     targets,
 )
-from ..timestamps import TimestampRepair
+from ..timestamps import MOST_NS, TimestampRepair
 
 #: Share of the full scale at which a 16-bit converter says its last count.
 LAST_COUNT = 1 - 1.5 / 32768
@@ -239,6 +239,8 @@ class _File:
                     text = block[f"c{place}"]
                     columns[name] = self._column(name, target, text, lines, topic.name if many else name)
         frame = pl.DataFrame(columns)
+        most = MOST_NS // self._tick
+        frame = frame.with_columns(t=pl.when(pl.col("t").is_between(-most, most)).then("t"))
         values = [c for c in frame.columns if c not in ("t", "line")]
         timeless = frame["t"].is_null()
         if timeless.any():
@@ -285,7 +287,7 @@ class _File:
             text = text.str.replace(",", ".", literal=True)
         if time.rate_hz is not None:
             count = text.cast(pl.Int64, strict=False).cast(pl.Float64)
-            return (count * (1e9 / time.rate_hz)).round(0).cast(pl.Int64)
+            return (count * (1e9 / time.rate_hz)).round(0).cast(pl.Int64, strict=False)
         # Decimals keep nanoseconds that a float of epoch seconds loses.
         scale = TICKS_NS[time.unit] // self._tick
         return (text.cast(pl.Decimal(38, 9), strict=False) * scale).round(0).cast(pl.Int64, strict=False)

@@ -12,11 +12,13 @@ from typing import ClassVar
 
 import polars as pl
 
+from ...recording.errors import MarchaError
 from ..columns import (
     Header,
     find_header,
     float_blocks,
     require_header,
+    with_ticks,
 )
 from ..contract import CommonOptions, Import, ReportBuilder
 from ..inertial import (
@@ -58,6 +60,10 @@ class XioCsv:
         path = one_file(paths, self.name)
         header = require_header(path, _is_header, WANTED)
         columns = x_io_columns(path, header.names, header.line)
+        if "t" not in columns:
+            raise MarchaError(
+                f"{path}, line {header.line}: no column is a time such as 'Time (s)'; repair the header"
+            )
         report = ReportBuilder()
         plans = [ChannelColumns("/foot/imu", IMU, complete(columns, ACC) | complete(columns, GYR))]
         if field := complete(columns, FIELD):
@@ -87,4 +93,4 @@ def _is_header(cells: Sequence[str]) -> bool:
 
 def _frames(path: Path, header: Header, time: SourceColumn, report: ReportBuilder) -> Iterator[pl.DataFrame]:
     for frame in float_blocks(path, header, time.name, report):
-        yield frame.with_columns(t=(pl.col(time.name) * time.factor).round().cast(pl.Int64)).drop(time.name)
+        yield with_ticks(frame, time.name, time.factor, report).drop(time.name)
