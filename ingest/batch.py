@@ -13,7 +13,7 @@ from . import registry
 from .archive import UNPACK_LIMIT_GB, is_zip, unpack
 
 
-class Batch(NamedTuple):
+class LogsFound(NamedTuple):
     """Logs that each become one recording.
 
     Attributes
@@ -44,7 +44,7 @@ def logs(
     *,
     format: str | None = None,
     unpack_limit_gb: float = UNPACK_LIMIT_GB,
-) -> Batch:
+) -> LogsFound:
     """Return every log that ``paths`` stand for, each to become one recording.
 
     A file stands for itself, whatever is in it: what is wrong is said when it is converted. A folder
@@ -92,7 +92,7 @@ def logs(
         found += inside if len(inside) > 1 or folder == path else [path]
     sides = {(log.parent, f"{log.stem}.truth") for log in found}  # they come along with their log
     skipped = [(p, why) for p, why in skipped if (p.parent, p.name[: p.name.find(".truth") + 6]) not in sides]
-    return Batch(list(dict.fromkeys(found)), skipped, archives)
+    return LogsFound(list(dict.fromkeys(found)), skipped, archives)
 
 
 def _names(path: Path, format: str | None) -> list[str]:
