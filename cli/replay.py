@@ -174,6 +174,7 @@ def evaluate(
     alignment: Annotated[Literal["none", "origin", "origin-yaw", "se2", "se3"], Shown] = "se3",
     reference: str | None = None,
     truth: Strings = (),
+    by: str | None = None,
     common: Common = DEFAULT,
 ) -> Outcome:
     """Measure the estimates of a replayed recording.
@@ -196,6 +197,8 @@ def evaluate(
     truth : str
         What is known of the walk beside what the recording says: closed=true, length_m=22.1, steps=63; may be
         repeated.
+    by : str
+        Tier of annotations (turn, terrain …): every figure by its labels, and of what lies between.
     """
     import msgspec
 
@@ -210,6 +213,7 @@ def evaluate(
         alignment=alignment,
         reference=reference,
         truth={k: str(v).lower() for k, v in settings(truth, "--truth").items()},
+        by=by,
     )
     say_losses(rec)
     missed = rp.check_thresholds(evaluation, *bounds)
@@ -226,8 +230,12 @@ def evaluate(
     ]
     lines: list[Heading | TextTable] = [columns_of(figures)]
     lines += [Heading(f"{r['run']}: {r['note']}") for r in runs if r["note"]]
-    for tier, label in dict.fromkeys((i["tier"], i["label"]) for r in runs for i in r["intervals"]):
-        lines += [Heading(f"\n{tier}: {label}"), columns_of(_within(runs, tier, label))]
+    if by is not None:
+        for r in runs:
+            lines += [Heading(f"\n{r['run']} by {by}"), columns_of(_by_label(r))]
+    else:
+        for tier, label in dict.fromkeys((i["tier"], i["label"]) for r in runs for i in r["intervals"]):
+            lines += [Heading(f"\n{tier}: {label}"), columns_of(_within(runs, tier, label))]
     lines += [Heading(_miss(m)) for m in missed]
     return Outcome(
         {"runs": runs, "missed": [msgspec.to_builtins(m) for m in missed]},
@@ -243,6 +251,24 @@ def _comparison(run: dict[str, Any]) -> dict[str, Any]:
         "dropped (samples)": run["dropped"],
         "alignment": run["alignment"],
     }
+
+
+def _by_label(run: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """Return one column a label of the tier, and one of what lies between."""
+    from ..replay.metrics import BETWEEN
+
+    return [
+        (
+            BETWEEN if g["label"] is None else g["label"] or "(no label)",
+            {
+                "intervals": g["intervals"],
+                "duration_s": g["duration_s"],
+                **({"matched (samples)": g["matched"]} if run["alignment"] else {}),
+                **g["metrics"],
+            },
+        )
+        for g in run["groups"]
+    ]
 
 
 def _within(runs: list[dict[str, Any]], tier: str, label: str) -> list[tuple[str, dict[str, Any]]]:

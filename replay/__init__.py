@@ -13,7 +13,7 @@ from .evaluate import (
     evaluate,
 )
 from .gaps import GapPolicy
-from .metrics import RunView, Truth, nees_bounds
+from .metrics import nees_bounds
 from .plan import Plan, PlannedRun, plan_runs
 from .results import ReplayResult, Run
 from .sinks import RecordingSink, Sink, TableSink
@@ -27,6 +27,7 @@ from .sources import (
 )
 from .specs import EstimatorSpec, parse_estimator
 from .tuning import Tuned, tune
+from .view import RunView, Truth
 
 __all__ = [
     "ALIGNMENTS",

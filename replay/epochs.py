@@ -11,6 +11,18 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ..recording.errors import UsageError
+from .view import inside
+
+PAUSE_S = 3.0
+"""A stride that takes longer is standing in between."""
+
+_FIGURES = ("distance_m", "cadence_per_min", "{}_time_s", "{}_length_m", "speed_m_s")
+_VARIATION = ("{}_time_cv", "{}_length_cv")
+GAIT = {
+    True: tuple(n.format("stride") for n in (*_FIGURES, "stance_share", *_VARIATION)),
+    False: tuple(n.format("step") for n in (*_FIGURES, *_VARIATION)),
+}
+"""Gait parameters of one foot (True), and of a sensor on the body."""
 
 
 class Band(msgspec.Struct, frozen=True):
@@ -91,57 +103,81 @@ def normalized(
     return Band(100.0 * share, strides, mean, sd)
 
 
-def gait_parameters(steps: pl.DataFrame, annotations: pl.DataFrame) -> pl.DataFrame:
+def gait_parameters(steps: pl.DataFrame, annotations: pl.DataFrame, *, one_foot: bool = True) -> pl.DataFrame:
     """Return one row an annotation with the gait parameters of the steps that end in it.
 
     Parameters
     ----------
     steps : polars.DataFrame
-        Rows of a ``marcha_msgs/msg/Step`` channel of one foot: each is a stride, from the start of a swing
-        to its end.
+        Rows of a ``marcha_msgs/msg/Step`` channel.
     annotations : polars.DataFrame
         Intervals; a step belongs to one where its end lies in it.
+    one_foot : bool
+        See :func:`gait_of`.
 
     Returns
     -------
     polars.DataFrame
-        ``id, tier, label, strides, distance_m, cadence_per_min`` (steps of both feet), ``stride_time_s``,
-        ``stride_length_m``, ``speed_m_s``, ``stance_share``, and ``…_cv`` (standard deviation over mean) of
-        time and length. Times are from one end of a swing to the next inside the annotation; null where
-        there are too few strides.
+        ``id, tier, label`` and the figures of :func:`gait_of`; null where there are too few strides.
     """
-    table = steps.sort("end_ns").with_columns(
-        stride_s=(pl.col("end_ns") - pl.col("end_ns").shift()) * 1e-9,
-        swing_s=(pl.col("end_ns") - pl.col("start_ns")) * 1e-9,
-        before_ns=pl.col("end_ns").shift(),
-    )
-    rows = []
-    for mark in annotations.iter_rows(named=True):
-        part = table.filter(pl.col("end_ns").is_between(mark["start_ns"], mark["end_ns"]))
-        timed = part.filter(pl.col("before_ns") >= mark["start_ns"])
-        time, length = timed["stride_s"].to_numpy(), part["length_m"].to_numpy()
-        whole = float(time.sum()) if len(time) else None
-        rows.append(
-            {
-                "id": mark["id"],
-                "tier": mark["tier"],
-                "label": mark["label"],
-                "strides": part.height,
-                "distance_m": float(length.sum()),
-                "cadence_per_min": 120.0 * len(time) / whole if whole else None,
-                "stride_time_s": whole / len(time) if whole else None,
-                "stride_length_m": float(length.mean()) if len(length) else None,
-                "speed_m_s": float(timed["length_m"].to_numpy().sum()) / whole if whole else None,
-                "stance_share": 1.0 - float(timed["swing_s"].to_numpy().sum()) / whole if whole else None,
-                "stride_time_cv": _variation(time),
-                "stride_length_cv": _variation(length),
-            }
-        )
-    names = ("distance_m", "cadence_per_min", "stride_time_s", "stride_length_m", "speed_m_s", "stance_share")
-    numbers = dict.fromkeys((*names, "stride_time_cv", "stride_length_cv"), pl.Float64)
-    schema = {"id": pl.String, "tier": pl.String, "label": pl.String, "strides": pl.Int64, **numbers}
+    names, counts = GAIT[one_foot], ("strides" if one_foot else "steps",)
+    rows = [
+        {k: mark[k] for k in ("id", "tier", "label")}
+        | gait_of(steps, np.array([[mark["start_ns"], mark["end_ns"] + 1]], np.int64), one_foot=one_foot)
+        for mark in annotations.iter_rows(named=True)
+    ]
+    schema: dict[str, type[pl.DataType]] = dict.fromkeys(("id", "tier", "label"), pl.String)
+    schema |= dict.fromkeys(counts, pl.Int64) | dict.fromkeys(names, pl.Float64)
     return pl.DataFrame(rows, schema=schema)
 
 
-def _variation(values: NDArray[np.float64]) -> float | None:
-    return float(values.std(ddof=1) / values.mean()) if len(values) > 1 and values.mean() else None
+def gait_of(
+    steps: pl.DataFrame, spans: NDArray[np.int64] | None = None, *, one_foot: bool = True
+) -> dict[str, float]:
+    """Return the gait parameters of the steps that end in stretches of time.
+
+    Parameters
+    ----------
+    steps : polars.DataFrame
+        ``start_ns, end_ns, length_m`` of steps.
+    spans : ndarray of int64, shape (k, 2), or None
+        Half open, apart, in order; everything where it is None.
+    one_foot : bool
+        Whether they are those of one foot: each is a stride, from the start of a swing to its end. Else
+        those of a sensor on the body, which sees the steps of both feet.
+
+    Returns
+    -------
+    dict
+        ``strides, distance_m, cadence_per_min`` (steps of both feet), ``stride_time_s, stride_length_m,
+        speed_m_s, stance_share`` and ``…_cv`` (standard deviation over mean) of time and length; for a sensor on
+        the body ``steps``, ``step_time_s`` and so on, without a stance. Times are from one end to the next
+        inside a stretch; what takes longer than :data:`PAUSE_S` is standing and has no part in them. What has
+        too few strides is left out.
+    """
+    word = "stride" if one_foot else "step"
+    table = steps.sort("end_ns")
+    end, start = table["end_ns"].to_numpy(), table["start_ns"].to_numpy()
+    length = table["length_m"].to_numpy()
+    if spans is None:
+        where = np.zeros(len(end), np.int64)
+    else:
+        where = np.where(inside(end, spans), np.searchsorted(spans[:, 0], end, side="right"), -1)
+    here = where >= 0
+    time = np.diff(end) * 1e-9
+    timed = np.r_[False, here[1:] & (where[1:] == where[:-1]) & (time <= PAUSE_S)][: len(end)]
+    time = time[timed[1:]]
+    found: dict[str, float] = {f"{word}s": int(here.sum()), "distance_m": float(np.nansum(length[here]))}
+    if here.any():
+        found[f"{word}_length_m"] = float(length[here].mean())
+    if len(time):
+        whole = float(time.sum())
+        found["cadence_per_min"] = (120.0 if one_foot else 60.0) * len(time) / whole
+        found[f"{word}_time_s"] = whole / len(time)
+        found["speed_m_s"] = float(length[timed].sum()) / whole
+        if one_foot:
+            found["stance_share"] = 1.0 - float((end - start)[timed].sum() * 1e-9) / whole
+    for name, values in ((f"{word}_time_cv", time), (f"{word}_length_cv", length[here])):
+        if len(values) > 1 and values.mean():
+            found[name] = float(values.std(ddof=1) / values.mean())
+    return found

@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 import msgspec
+import numpy as np
 import polars as pl
 
 from ..recording import Recording
 from ..recording.errors import MarchaError, UsageError
-from .metrics import RunView, Truth, available_metrics
+from .alignment import IntArray
+from .metrics import available_metrics
 from .references import reference_of
+from .view import RunView, Truth, joined
 
 
 class IntervalEvaluation(msgspec.Struct):
@@ -39,6 +43,31 @@ class IntervalEvaluation(msgspec.Struct):
     dropped: int
 
 
+class GroupEvaluation(msgspec.Struct):
+    """Metrics of all intervals of a tier that have one label, taken together.
+
+    Attributes
+    ----------
+    label : str or None
+        None: what none of the tier's intervals covers.
+    intervals : int
+        How many; for the rest, the stretches between them.
+    duration_s : float
+        Their time together; what several cover counts once.
+    metrics : dict of str to float
+        As overall, but those that need one stretch with a start and an end, or the whole walk.
+    matched, dropped : int
+        As overall. Over the groups of labels that do not overlap they add up to the walk's.
+    """
+
+    label: str | None
+    intervals: int
+    duration_s: float
+    metrics: dict[str, float]
+    matched: int
+    dropped: int
+
+
 class RunEvaluation(msgspec.Struct):
     """Metrics of one run.
 
@@ -60,6 +89,8 @@ class RunEvaluation(msgspec.Struct):
         Why there are no metrics.
     intervals : list of IntervalEvaluation
         Per annotated interval.
+    groups : list of GroupEvaluation
+        Per label of the tier that was asked for.
     """
 
     run: str
@@ -73,6 +104,7 @@ class RunEvaluation(msgspec.Struct):
     time_base: str = ""
     note: str = ""
     intervals: list[IntervalEvaluation] = []
+    groups: list[GroupEvaluation] = []
 
 
 class Evaluation(msgspec.Struct):
@@ -106,6 +138,8 @@ def evaluate(
     reference: str | None = None,
     intervals: bool = True,
     truth: Mapping[str, str] | None = None,
+    by: str | None = None,
+    annotations: pl.DataFrame | None = None,
 ) -> Evaluation:
     """Measure every run of a replayed recording.
 
@@ -126,6 +160,11 @@ def evaluate(
         Whether annotated intervals are measured too.
     truth : mapping, optional
         What is known of the walk beside what the recording says: ``closed``, ``length_m``, ``steps``.
+    by : str, optional
+        Tier whose labels are measured one beside the other, with what lies between. A run's own tier
+        (``turn`` for ``<run>/turn``) comes before one of this name.
+    annotations : polars.DataFrame, optional
+        To be used instead of those of the recording.
 
     Returns
     -------
@@ -136,7 +175,7 @@ def evaluate(
     MarchaError
         Where the recording has no estimates.
     UsageError
-        An unknown run, alignment or reference.
+        An unknown run, alignment, reference or tier.
     """
     lineages = {n.removeprefix("run/"): m for n, m in rec.metadata.items() if n.startswith("run/")}
     for topic in rec.channels:  # estimates of others' tools have no record
@@ -160,8 +199,14 @@ def evaluate(
         for run, lineage in lineages.items()
         if runs is None or run in runs
     ]
-    marked = _intervals(rec.annotations, lineages) if intervals else pl.DataFrame()
-    return Evaluation([evaluate_run(view, marked) for view in views])
+    marks = rec.annotations if annotations is None else annotations
+    if by is not None and not marks["tier"].is_in([by, *(f"{v.run}/{by}" for v in views)]).any():
+        raise UsageError(
+            f"{rec.path}: no tier {by!r}; there are {', '.join(marks['tier'].unique(maintain_order=True)) or 'none'} "
+            "(`marcha annotate rules` adds turns, stairs and the like)"
+        )
+    marked = _intervals(marks, lineages) if intervals else pl.DataFrame()
+    return Evaluation([evaluate_run(v, marked, _tier(marks, v.run, by) if by else None) for v in views])
 
 
 def recording_view(
@@ -236,7 +281,9 @@ def _track_references(rec: Recording, input_topic: str, chosen: str | None) -> t
     return track, beside if beside in rec.channels else None
 
 
-def evaluate_run(view: RunView, intervals: pl.DataFrame | None = None) -> RunEvaluation:
+def evaluate_run(
+    view: RunView, intervals: pl.DataFrame | None = None, tier: pl.DataFrame | None = None
+) -> RunEvaluation:
     """Measure one run; a run that is fatal or was restarted in between is said so, not measured.
 
     Parameters
@@ -245,6 +292,8 @@ def evaluate_run(view: RunView, intervals: pl.DataFrame | None = None) -> RunEva
         The run.
     intervals : polars.DataFrame, optional
         Annotated intervals (``tier, start_ns, end_ns, label``) to measure as well.
+    tier : polars.DataFrame, optional
+        Intervals to measure together by label.
     """
     done = RunEvaluation(view.run, view.estimator, view.lineage.get("input", ""))
     if view.lineage.get("fatal") == "true":
@@ -263,13 +312,56 @@ def evaluate_run(view: RunView, intervals: pl.DataFrame | None = None) -> RunEva
         done.time_base = "estimate" if view.comparison.on_estimate else "reference"
         done.max_time_difference_s = view.comparison.matches.max_distance_s
     for row in intervals.iter_rows(named=True) if intervals is not None else ():
-        part = view.interval(row["start_ns"], row["end_ns"] + 1)  # annotations include their end
+        part = view.part(_spans([row["start_ns"]], [row["end_ns"]]))
         done.intervals.append(
             IntervalEvaluation(
                 row["tier"], row["label"], row["start_ns"], row["end_ns"], _measure(part), *_matched(part)
             )
         )
+    if tier is not None:
+        done.groups = _groups(view, tier)
     return done
+
+
+def _groups(view: RunView, tier: pl.DataFrame) -> list[GroupEvaluation]:
+    """Measure the intervals of each label together, and what no interval covers."""
+    by_label = tier.partition_by("label", as_dict=True, maintain_order=True)
+    parts: list[tuple[str | None, int, IntArray]] = [
+        (str(label), rows.height, _spans(rows["start_ns"], rows["end_ns"]))
+        for (label,), rows in by_label.items()
+    ]
+    covered = joined(_spans(tier["start_ns"], tier["end_ns"]))
+    limits = np.iinfo(np.int64)
+    edges = np.r_[limits.min, covered.ravel(), limits.max].reshape(-1, 2)
+    first, last = _extent(view)
+    parts.append((None, int(((edges[:, 1] > first) & (edges[:, 0] <= last)).sum()), edges))
+    found = []
+    for label, count, spans in parts:
+        part = view.part(spans)
+        assert part.spans is not None
+        inner = np.clip(part.spans, first, last)
+        seconds = float((inner[:, 1] - inner[:, 0]).sum()) * 1e-9
+        found.append(GroupEvaluation(label, count, seconds, _measure(part), *_matched(part)))
+    return found
+
+
+def _spans(start_ns: Any, end_ns: Any) -> IntArray:
+    """Return half-open stretches (k, 2) of annotations, which include their end."""
+    return np.column_stack((np.asarray(start_ns, np.int64), np.asarray(end_ns, np.int64) + 1))
+
+
+def _extent(view: RunView) -> tuple[int, int]:
+    """Return the first and the last time that the run, or its recording, speaks of."""
+    if view.recording is not None and view.recording.channels:
+        return view.recording.start_ns, view.recording.end_ns
+    return (int(view.track.t_ns[0]), int(view.track.t_ns[-1])) if view.track is not None else (0, 0)
+
+
+def _tier(annotations: pl.DataFrame, run: str, tier: str) -> pl.DataFrame:
+    """Return the intervals of a run's own tier, else of the tier of this name."""
+    lasting = annotations.filter(pl.col("end_ns") > pl.col("start_ns"))
+    own = lasting.filter(pl.col("tier") == f"{run}/{tier}")
+    return own if own.height else lasting.filter(pl.col("tier") == tier)
 
 
 def check_thresholds(

@@ -15,9 +15,10 @@ import polars as pl
 
 from ..algorithms.contract import FloatArray
 from .alignment import IntArray
+from .view import inside
 
 if TYPE_CHECKING:
-    from .metrics import RunView
+    from .view import RunView
 
 SETTLING_S = 1.2
 """Start of a run that is left out, as in the source."""
@@ -161,15 +162,31 @@ def matched(
     return r, value, reference
 
 
-def figures(t_ns: IntArray, angle: FloatArray, ref_ns: IntArray, reference: FloatArray) -> dict[str, float]:
-    """Return all figures of one joint, names without the joint's."""
+def figures(
+    t_ns: IntArray,
+    angle: FloatArray,
+    ref_ns: IntArray,
+    reference: FloatArray,
+    spans: IntArray | None = None,
+) -> dict[str, float]:
+    """Return all figures of one joint, names without the joint's; of stretches of time where they are given.
+
+    Cycles are those of the whole walk that lie in a stretch whole.
+    """
     at, value, truth = matched(t_ns, angle, ref_ns, reference)
+    starts = starts_from_signal(at, truth)
+    parts = [starts] if spans is None else [starts[inside(starts, s[None])] for s in spans]
+    curves = [(cycles_of(at, value, p), cycles_of(at, truth, p)) for p in parts if at.size]
+    if spans is not None:
+        keep = inside(at, spans)
+        at, value, truth = at[keep], value[keep], truth[keep]
     if at.size == 0:
         return {}
     error = wrapped_deg(value, truth)
     low, high = bland_altman_deg(error)
     good = np.isfinite(angle)
     found = {
+        "samples": float(at.size),
         "rmse_deg": rmse_deg(error),
         "rmse_unbiased_deg": rmse_unbiased_deg(error),
         "bias_deg": bias_deg(error),
@@ -179,8 +196,7 @@ def figures(t_ns: IntArray, angle: FloatArray, ref_ns: IntArray, reference: Floa
         "agreement_low_deg": low,
         "agreement_high_deg": high,
     }
-    starts = starts_from_signal(at, truth)
-    ours, theirs = cycles_of(at, value, starts), cycles_of(at, truth, starts)
+    ours, theirs = (np.concatenate(c) for c in zip(*curves, strict=True))
     whole = np.isfinite(ours).all(axis=1) & np.isfinite(theirs).all(axis=1)
     if whole.sum() >= 2:
         ours, theirs = ours[whole], theirs[whole]
@@ -196,13 +212,14 @@ def figures(t_ns: IntArray, angle: FloatArray, ref_ns: IntArray, reference: Floa
 
 def joints(view: RunView) -> dict[str, float]:
     """Errors of joint angles: RMSE, bias, correlation, range of motion, delay, limits of agreement, cycles."""
-    ours, truth = view.table("joint"), view.reference_table("joint")
+    base = view.whole or view
+    ours, truth = base.table("joint"), base.reference_table("joint")
     if ours is None or truth is None:
         return {}
     found: dict[str, float] = {}
     for name in _joints(ours):
         if name in truth.columns:
-            values = figures(*_column(ours, name), *_column(truth, name))
+            values = figures(*_column(ours, name), *_column(truth, name), spans=view.spans)
             found.update({f"{key}.{name}": value for key, value in values.items()})
     return found
 

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .alignment import IntArray
+from .view import inside
 
 if TYPE_CHECKING:
     import polars as pl
 
-    from .metrics import RunView
+    from .view import RunView
 
 TOLERANCE_NS = 150_000_000
 """A step is right within this of one of the reference, once a constant offset is taken off."""
@@ -23,18 +24,25 @@ def phone(view: RunView) -> dict[str, float]:
     A detector's end of a step is another instant of the gait than the reference's; the offset between them is
     told and taken off. A step of one matches one of the other at most.
     """
-    ours, truth = view.table("step"), view.reference_table("steps")
+    base = view.whole or view
+    ours, truth = base.table("step"), base.reference_table("steps")
     if ours is None or truth is None or truth.is_empty():
         return {}
     found: dict[str, float] = {}
-    if not view.truth.steps:  # else it is measured against what the recording states
-        found["steps_error_percent"] = 100.0 * abs(ours.height - truth.height) / truth.height
     mine, theirs = _ends(ours), _ends(truth)
     offset = constant_offset(mine, theirs)
-    right = matched(mine - offset, theirs)
-    found["steps_recall"] = right / theirs.size
+    here, there = matched(mine - offset, theirs)
+    if view.spans is not None:  # partners are found in the whole walk; each side counts where it lies itself
+        own, known = inside(mine, view.spans), inside(theirs, view.spans)
+        here, there = here[own[here]], there[known[there]]
+        mine, theirs = mine[own], theirs[known]
+    if not theirs.size:
+        return {}
+    if not view.truth.steps:  # else it is measured against what the recording states
+        found["steps_error_percent"] = 100.0 * abs(mine.size - theirs.size) / theirs.size
+    found["steps_recall"] = there.size / theirs.size
     if mine.size:
-        found["steps_precision"] = right / mine.size
+        found["steps_precision"] = here.size / mine.size
         found["steps_offset_s"] = offset * 1e-9
     return found
 
@@ -65,17 +73,20 @@ def constant_offset(mine: IntArray, theirs: IntArray, tolerance_ns: int = TOLERA
     return int(np.median(pairs[first[k] : last[k]]))
 
 
-def matched(mine: IntArray, theirs: IntArray, tolerance_ns: int = TOLERANCE_NS) -> int:
-    """Return how many pairs of one and one lie within the tolerance, the most that there can be.
+def matched(mine: IntArray, theirs: IntArray, tolerance_ns: int = TOLERANCE_NS) -> tuple[IntArray, IntArray]:
+    """Return the indices of pairs of one and one within the tolerance, as many as there can be.
 
     Both in the order of time: the earliest partner that is left is never a worse choice than a later one.
     """
-    i = j = count = 0
+    i = j = 0
+    pairs: list[tuple[int, int]] = []
     while i < mine.size and j < theirs.size:
         if abs(int(mine[i]) - int(theirs[j])) <= tolerance_ns:
-            i, j, count = i + 1, j + 1, count + 1
+            pairs.append((i, j))
+            i, j = i + 1, j + 1
         elif mine[i] < theirs[j]:
             i += 1
         else:
             j += 1
-    return count
+    found = np.array(pairs, np.int64).reshape(-1, 2)
+    return found[:, 0], found[:, 1]

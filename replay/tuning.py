@@ -22,9 +22,10 @@ from ..recording.errors import UsageError
 from .api import replay as replay_recording
 from .engine import Progress
 from .evaluate import recording_view, truth_of
-from .metrics import Truth, closure, distance
+from .metrics import closure, distance
 from .results import Run
 from .specs import EstimatorSpec, parse_estimator, parse_value
+from .view import Truth
 
 MOST_POINTS = 4096
 """A grid of more points is refused: coordinates one after another, or fewer values."""

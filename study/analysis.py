@@ -311,4 +311,6 @@ def remarks(cells: Sequence[Any], config: cfg.StudyConfig) -> list[str]:
         for m in config.metrics
         if m.column not in have
     ]
+    if config.by and not any(c.by_label for c in cells):
+        notes.append(f"no recording has the tier {config.by!r}, and no rule of this name finds anything")
     return notes

@@ -17,13 +17,18 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import polars as pl
 
 from ..algorithms import make
-from ..recording import MarchaError, OutputExists, Recording
+from ..export.rules import RULES, by_rules
+from ..recording import MarchaError, OutputExists, Recording, UsageError
 from ..recording import create as create_recording
 from ..recording import open as open_recording
+from ..recording.selection import Selection
 from ..replay.api import replay
 from ..replay.attachment import NOT_RAW
+from ..replay.evaluate import evaluate
+from ..replay.metrics import BETWEEN
 from ..replay.results import Run
 from ..replay.runs import warm_up
 from ..replay.specs import EstimatorSpec
@@ -62,6 +67,8 @@ class StudyCell(msgspec.Struct, frozen=True):
         Every metric of the run.
     track : bytes
         Thinned positions, float32 (n, 3), in metres.
+    by_label : dict of str to dict of str to float
+        Every metric by the labels of the study's tier.
     """
 
     key: str
@@ -82,6 +89,7 @@ class StudyCell(msgspec.Struct, frozen=True):
     run_time_s: float = math.nan
     metrics: dict[str, float] = {}
     track: bytes = b""
+    by_label: dict[str, dict[str, float]] = {}
 
     @property
     def positions(self) -> np.ndarray:
@@ -104,7 +112,7 @@ def run_task(task: StudyTask) -> list[StudyCell]:
     rec = open_recording(path)
     topics = chosen(rec, task.inputs)
     try:
-        return _run(rec, task.source, task.jobs, topics)
+        return _run(rec, task, task.jobs, topics)
     except Exception as error:
         if len(task.jobs) == 1:
             return failed(task, error)
@@ -112,7 +120,7 @@ def run_task(task: StudyTask) -> list[StudyCell]:
     cells: list[StudyCell] = []
     for job in task.jobs:
         try:
-            cells += _run(rec, task.source, [job], topics)
+            cells += _run(rec, task, [job], topics)
         except Exception as error:
             cells += failed(msgspec.structs.replace(task, jobs=[job]), error)
     return cells
@@ -200,10 +208,9 @@ def warm(name: str) -> None:
     warm_up(estimator, blocks=not getattr(estimator, "offline", False))
 
 
-def _run(
-    rec: Recording, source: StudyRecording, jobs: Sequence[Job], topics: list[str] | None
-) -> list[StudyCell]:
+def _run(rec: Recording, task: StudyTask, jobs: Sequence[Job], topics: list[str] | None) -> list[StudyCell]:
     """Replay one recording through all methods in one pass."""
+    source = task.source
     for job in jobs:
         warm(job.method.estimator)
     specs = [
@@ -214,7 +221,12 @@ def _run(
         )
         for number, job in enumerate(jobs)
     ]
-    result = replay(rec, specs, inputs=topics)
+    if task.by:
+        with tempfile.TemporaryDirectory(prefix="marcha-") as folder:
+            result = replay(rec, specs, inputs=topics, out=Path(folder) / "done.mcap")
+            by_label = _by_label(open_recording(Path(folder) / "done.mcap"), task.by)
+    else:
+        result, by_label = replay(rec, specs, inputs=topics), {}
     imported = _import_findings(rec)
     cells: list[StudyCell] = []
     for run in result.runs:
@@ -240,9 +252,26 @@ def _run(
                 run_time_s=run.loop_s,
                 metrics={k: float(v) for k, v in run.metrics.items() if isinstance(v, int | float)},
                 track=_track(run),
+                by_label=by_label.get(run.run, {}),
             )
         )
     return cells
+
+
+def _by_label(rec: Recording, tier: str) -> dict[str, dict[str, dict[str, float]]]:
+    """Return every run's metrics by the labels of a tier; none where there is neither tier nor rule."""
+    marks = rec.annotations
+    known = (marks["tier"] == tier) | marks["tier"].str.ends_with(f"/{tier}")
+    if tier in RULES and not known.any():
+        marks = pl.concat([marks, by_rules(rec, [tier], Selection()).select(marks.columns)])
+    try:
+        runs = evaluate(rec, intervals=False, by=tier, annotations=marks).runs
+    except UsageError:  # a walk without this tier has no labels
+        return {}
+    return {
+        r.run: {BETWEEN if g.label is None else g.label or "(no label)": g.metrics for g in r.groups}
+        for r in runs
+    }
 
 
 def _import_findings(rec: Recording) -> list[dict[str, Any]]:

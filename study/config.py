@@ -258,6 +258,9 @@ class StudyConfig(_Table, frozen=True, kw_only=True):
         What is tabulated and tested. Every metric is in ``results.parquet`` anyway.
     tracks : bool
         Keep thinned tracks and draw them.
+    by : str
+        Tier of annotations (``terrain``, ``turn``): the metrics are also taken by its labels and between them,
+        and compared. A rule of this name (``turn``, ``stair`` …) is applied where a recording has no such tier.
     """
 
     title: str = "Study"
@@ -272,6 +275,7 @@ class StudyConfig(_Table, frozen=True, kw_only=True):
     statistics: Statistics = Statistics()
     published: list[Published] = []
     tracks: bool = True
+    by: str = ""
 
 
 class Method(msgspec.Struct, frozen=True):

@@ -93,6 +93,8 @@ class StudyTask(msgspec.Struct, frozen=True):
         Globs of topics.
     folder : str
         Where converted and simulated recordings are kept.
+    by : str
+        Tier by whose labels is measured as well.
     """
 
     name: str
@@ -100,6 +102,7 @@ class StudyTask(msgspec.Struct, frozen=True):
     jobs: list[Job]
     inputs: list[str]
     folder: str
+    by: str = ""
 
 
 def digest(*parts: Any) -> str:
@@ -244,7 +247,7 @@ def _walks(simulate: cfg.Simulate, code: str) -> list[StudyRecording]:
 def jobs(config: cfg.StudyConfig, source: StudyRecording) -> list[Job]:
     """Return every method on one recording with its key."""
     return [
-        Job(digest(source.digest, source.name, config.inputs, method), method)
+        Job(digest(source.digest, source.name, config.inputs, method, config.by), method)
         for method in cfg.methods(config)
     ]
 
@@ -288,6 +291,7 @@ def tasks(
                     jobs=part,
                     inputs=config.inputs,
                     folder=str(folder),
+                    by=config.by,
                 )
             )
     # The largest first: no long task is left for the end.

@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from html import escape
+from itertools import product
 from typing import Any
 
 import msgspec
 import polars as pl
 
+from ..replay.metrics import BETWEEN
 from ..viz.page import Html, PagePicture, number
 from . import config as cfg
-from .analysis import order
+from .analysis import FACTORS, order
+from .labels import label_means
 
 
 class ReportContents(msgspec.Struct, frozen=True):
@@ -24,6 +27,8 @@ class ReportContents(msgspec.Struct, frozen=True):
         The study.
     results, values, groups, comparisons, outliers, published, consistency : polars.DataFrame
         Tables of :mod:`~marcha.study.analysis`.
+    labels, label_comparisons : polars.DataFrame
+        Tables of :mod:`~marcha.study.labels`.
     notes : list of str
         What a reader must know before the numbers.
     provenance : dict
@@ -40,6 +45,8 @@ class ReportContents(msgspec.Struct, frozen=True):
     outliers: pl.DataFrame
     published: pl.DataFrame
     consistency: pl.DataFrame
+    labels: pl.DataFrame
+    label_comparisons: pl.DataFrame
     notes: list[str]
     provenance: dict[str, Any]
     toml: str
@@ -78,6 +85,8 @@ def render(contents: ReportContents, pictures: Sequence[PagePicture]) -> str:
             _methods(html, contents, levels)
         for title, section in (("Box plots", "box"), ("Tracks", "tracks"), ("Run time", "run time")):
             _gallery(html, pictures, title, section)
+        if len(contents.labels):
+            _labels(html, contents, levels)
         if len(contents.consistency):
             _consistency(html, contents, pictures)
         _normality(html, contents, pictures)
@@ -389,6 +398,44 @@ def _comparisons(html: Html, contents: ReportContents) -> None:
             )
             html.table(head, body)
             html.parts.append("</details>")
+
+
+def _labels(html: Html, contents: ReportContents, levels: dict[str, list[str]]) -> None:
+    by, level = contents.config.by, 1 - contents.config.statistics.confidence
+    html.section(f"By {by}")
+    html.text(
+        f"Metrics taken over all intervals of a label of the tier {by} together, and over what lies between "
+        "them, under the alignment of the whole walk. Mean ± standard deviation (n), then every pair of labels "
+        "within a walk: paired t test and Wilcoxon's signed-rank test, two-sided, corrected by Holm within the "
+        f"method. Red: below {level:.2f} after the correction."
+    )
+    means = label_means(contents.labels)
+    labels = sorted(means["label"].unique(), key=lambda label: (label == BETWEEN, label))
+    found = {(r["metric"], *(r[f] for f in FACTORS), r["label"]): r for r in means.iter_rows(named=True)}
+    for (metric, unit), pairs in contents.label_comparisons.group_by("metric", "unit", maintain_order=True):
+        html.heading(f"{metric} ({unit})" if unit else str(metric))
+        methods = list(product(levels["filter"], levels["detector"], levels["configuration"]))
+        rows = []
+        for method in methods:
+            cells = [found.get((metric, *method, label)) for label in labels]
+            if any(cells):
+                values = [f"{mean_sd(c)} ({c['n']})" if c else "–" for c in cells]
+                rows.append([*(escape(m) for m in method), *values])
+        html.table([*FACTORS, *(escape(label) for label in labels)], rows, 3)
+        body = [
+            [
+                escape(f"{r['a']} − {r['b']}"),
+                *(escape(r[f]) for f in FACTORS),
+                str(r["n"]),
+                f"{number(r['difference'])} ({number(r['difference_low'])} … {number(r['difference_high'])})",
+                number(r["effect"]),
+                ("@differs " if r["t_p_holm"] < level else "") + probability(r["t_p_holm"]),
+                ("@differs " if r["rank_p_holm"] < level else "") + probability(r["rank_p_holm"]),
+            ]
+            for r in pairs.iter_rows(named=True)
+        ]
+        head = ["pair", *FACTORS, "n", "difference", "d", "t p (Holm)", "Wilcoxon p (Holm)"]
+        _folded(html, f"{len(body)} pairs", head, body, 4)
 
 
 def _outliers(html: Html, contents: ReportContents) -> None:

@@ -215,6 +215,67 @@ def compare(
     )
 
 
+class PairedComparison(msgspec.Struct, frozen=True):
+    """Two values of each walk compared.
+
+    Attributes
+    ----------
+    n : int
+        Pairs.
+    difference, difference_low, difference_high : float
+        Mean of a − b with its interval by Student's t.
+    t, t_p : float
+        Paired t test, two-sided, with n − 1 degrees of freedom.
+    effect : float
+        Mean difference over its standard deviation (Cohen's d for paired values).
+    rank_p : float
+        Wilcoxon's signed-rank test, two-sided.
+    t_p_holm, rank_p_holm : float
+        Corrected by Holm within their family; NaN until then.
+    note : str
+        Why something was not computed.
+    """
+
+    n: int
+    difference: float = NAN
+    difference_low: float = NAN
+    difference_high: float = NAN
+    t: float = NAN
+    t_p: float = NAN
+    effect: float = NAN
+    rank_p: float = NAN
+    t_p_holm: float = NAN
+    rank_p_holm: float = NAN
+    note: str = ""
+
+
+def paired(a: ArrayLike, b: ArrayLike, *, confidence: float = 0.95, min_samples: int = 3) -> PairedComparison:
+    """Compare two values of the same walks (finite, in the same order)."""
+    from scipy import stats
+
+    x, y = np.asarray(a, float), np.asarray(b, float)
+    difference = x - y
+    n = len(difference)
+    if n < min_samples:
+        return PairedComparison(n, note=f"not tested: {n} pairs, {min_samples} needed")
+    mean, sd = float(difference.mean()), float(difference.std(ddof=1))
+    if sd <= 1e-12 * max(np.abs(x).max(), np.abs(y).max()):
+        return PairedComparison(n, difference=mean, note="not tested: no spread of the differences")
+    test: Any = stats.ttest_rel(x, y)
+    rank: Any = stats.wilcoxon(x, y)
+    low, high = test.confidence_interval(confidence)
+    return PairedComparison(
+        n=n,
+        difference=mean,
+        difference_low=float(low),
+        difference_high=float(high),
+        t=float(test.statistic),
+        t_p=float(test.pvalue),
+        effect=mean / sd,
+        rank_p=float(rank.pvalue),
+    )
+
+
 def holm(p_values: ArrayLike) -> NDArray[np.float64]:
     """Return p values corrected by Holm's step-down rule; NaN entries are no members of the family."""
     p = np.asarray(p_values, float)

@@ -17,7 +17,7 @@ import polars as pl
 
 from ..recording import MarchaError, OutputExists, UsageError
 from ..viz.page import PagePicture
-from . import analysis, plan
+from . import analysis, labels, plan
 from . import config as cfg
 from .cells import (
     StudyCell,
@@ -30,7 +30,17 @@ from .gallery import draw
 from .report import ReportContents, render
 from .store import CellStore, tidy, write_atomic
 
-TABLES = ("results", "values", "groups", "comparisons", "outliers", "published", "consistency")
+TABLES = (
+    "results",
+    "values",
+    "groups",
+    "comparisons",
+    "outliers",
+    "published",
+    "consistency",
+    "labels",
+    "label_comparisons",
+)
 LIBRARIES = ("marcha", "numpy", "scipy", "numba", "polars", "matplotlib")
 
 
@@ -47,6 +57,8 @@ class StudyResult(msgspec.Struct, frozen=True):
         One row a cell.
     values, groups, comparisons, outliers, published, consistency : polars.DataFrame
         See :mod:`marcha.study.analysis`.
+    labels, label_comparisons : polars.DataFrame
+        See :mod:`marcha.study.labels`; empty where the study does not say ``by``.
     cells_run, cells_reused, cells_failed : int
         Cells computed now; found finished; that ended in an error.
     elapsed_s : float
@@ -66,6 +78,8 @@ class StudyResult(msgspec.Struct, frozen=True):
     outliers: pl.DataFrame
     published: pl.DataFrame
     consistency: pl.DataFrame
+    labels: pl.DataFrame
+    label_comparisons: pl.DataFrame
     cells_run: int
     cells_reused: int
     cells_failed: int
@@ -95,6 +109,7 @@ class StudyResult(msgspec.Struct, frozen=True):
             "comparisons": rows(self.comparisons),
             "outliers": rows(self.outliers),
             "consistency": rows(self.consistency),
+            "label_comparisons": rows(self.label_comparisons),
             "files": [str(f.relative_to(self.folder)) for f in self.files],
         }
 
@@ -216,6 +231,7 @@ def run_study(
             ),
         )
     groups, comparisons = tables
+    by_label = labels.label_values(cells, config)
     contents = ReportContents(
         config=config,
         results=results,
@@ -225,6 +241,8 @@ def run_study(
         outliers=analysis.outliers(values),
         published=analysis.beside_published(groups, config),
         consistency=consistency,
+        labels=by_label,
+        label_comparisons=labels.label_comparisons(by_label, config),
         notes=[*notes, *analysis.remarks(cells, config)],
         provenance=_provenance(code, started, scheduler or f"{executor.processes} processes"),
         toml=toml,
@@ -311,6 +329,14 @@ def _write(folder: Path, contents: ReportContents, pictures: list[PagePicture]) 
         "groups.csv": contents.groups.write_csv,
         "comparisons.csv": contents.comparisons.write_csv,
         "outliers.csv": contents.outliers.write_csv,
+        **(
+            {
+                "labels.csv": contents.labels.write_csv,
+                "label_comparisons.csv": contents.label_comparisons.write_csv,
+            }
+            if contents.config.by
+            else {}
+        ),
         "provenance.json": lambda path: path.write_bytes(provenance),
         "report.html": lambda path: path.write_text(page, encoding="utf-8"),
     }

@@ -19,7 +19,7 @@ MAY_IMPORT = {
     "ingest": {"recording"},
     "export": {"recording"},
     "replay": {"recording", "algorithms"},
-    "study": {"recording", "algorithms", "replay", "ingest", "viz"},
+    "study": {"recording", "algorithms", "replay", "ingest", "viz", "export"},  # export: annotations by rule
     "viz": {"recording", "replay", "export"},  # export: only for the contract that its RRD exporter fulfils
     "cli": set(PACKAGES) - {"cli"},
 }

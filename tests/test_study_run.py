@@ -23,7 +23,7 @@ from marcha.replay import replay
 from marcha.study import StudyConfig, StudyResult, gallery, plan, run_study
 from marcha.study import study as study_module
 from marcha.study.cells import cached
-from marcha.study.config import Recordings
+from marcha.study.config import Metric, Recordings
 from marcha.study.plan import find_sources
 
 CONFIG = """
@@ -374,3 +374,26 @@ def test_importing_the_study_loads_nothing_heavy() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=os.environ
     )
     assert done.stdout.strip() == "[]"
+
+
+def test_metrics_by_label_are_compared_walk_by_walk(
+    fixed_code: None, no_figures: None, tmp_path: Path
+) -> None:
+    by_turn = config(
+        by="turn",
+        published=[],
+        estimators=[e for e in config().estimators if e.label == "9IEZ"],
+        metrics=[Metric(column="ate_rmse_m", title="ATE", unit="m"), Metric(column="path_m", title="path")],
+    )
+    found = run_study(by_turn, tmp_path / "out", workers=1)
+    assert set(found.labels["label"]) <= {"turn left", "turn right", "(between)"}
+    assert found.labels["label"].n_unique() >= 2
+    whole = found.results.select("recording", "configuration", "input", whole="path_m")
+    parts = found.labels.filter(metric="path").group_by("recording", "configuration", "input")
+    both = parts.agg(pl.col("value").sum()).join(whole, on=["recording", "configuration", "input"])
+    assert both.height == found.results.height
+    assert both["value"].to_list() == pytest.approx(both["whole"].to_list())
+    pairs = found.label_comparisons.filter(metric="path", b="(between)")
+    assert (pairs["difference"] < 0).all()  # less way in the turns than along the sides
+    assert (tmp_path / "out" / "labels.csv").is_file()
+    assert "By turn" in (tmp_path / "out" / "report.html").read_text("utf-8")

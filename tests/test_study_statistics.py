@@ -17,6 +17,7 @@ from marcha.study.statistics import (
     holm,
     normal_quantiles,
     outlier_mask,
+    paired,
     summarize,
 )
 
@@ -141,3 +142,17 @@ def test_normal_quantiles_are_scipys(count: int) -> None:
 
     expected: Any = stats.probplot(np.arange(float(count)), fit=False)
     assert normal_quantiles(count) == pytest.approx(expected[0], rel=1e-12, abs=1e-12)
+
+
+def test_a_paired_comparison_of_the_sleep_data() -> None:
+    found = paired(SLEEP_1, SLEEP_2)  # R: t.test(extra ~ group, paired = TRUE)
+    assert found.t == pytest.approx(-4.0621, abs=5e-5)
+    assert found.t_p == pytest.approx(0.002833, abs=5e-7)
+    assert (found.difference_low, found.difference_high) == pytest.approx((-2.4598858, -0.7001142), abs=1e-6)
+    assert found.effect == pytest.approx(-4.0621 / math.sqrt(10), abs=1e-4)
+    assert found.rank_p == pytest.approx(0.003906, abs=0.006)  # nine pairs differ, with ties
+
+
+def test_what_cannot_be_paired_is_said() -> None:
+    assert paired(SLEEP_1[:2], SLEEP_2[:2]).note.startswith("not tested: 2 pairs")
+    assert "no spread" in paired([1.0, 2.0, 3.0], [2.0, 3.0, 4.0]).note

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..recording import Recording
 from ..recording.atomic import AtomicFile
 from ..recording.errors import UsageError
-from ..replay.metrics import Comparison
+from ..replay.view import Comparison
 from . import style
 from .text import printable
 from .trace import Trace, compared, distance, framed, reference_of

@@ -9,7 +9,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ..replay.alignment import Transform
-from ..replay.metrics import POSITION, QUATERNION, Comparison, RunView, compare
+from ..replay.view import POSITION, QUATERNION, Comparison, RunView, compare
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -151,7 +151,7 @@ def reference_of(run: str, references: Sequence[str]) -> str | None:
 
 
 def compared(trace: Trace, reference: Trace, alignment: str) -> Comparison | None:
-    """Lay a trace upon a reference by :func:`marcha.replay.metrics.compare`, as the evaluation does.
+    """Lay a trace upon a reference by :func:`marcha.replay.view.compare`, as the evaluation does.
 
     Returns
     -------

@@ -1,0 +1,368 @@
+"""What a metric looks at: the results of one run, the reference and the truth, as a whole or in parts.
+
+A part is a set of stretches of time. It keeps the alignment of the whole walk, so that what is counted or summed
+over parts that make up the walk is what the whole says.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from ..algorithms.contract import FloatArray
+from .alignment import IntArray, Matches, Transform, align, match, wrap, yaw_of
+from .references import reference_of, references
+
+if TYPE_CHECKING:
+    from ..recording import Recording
+
+POSITION = ("pos_x", "pos_y", "pos_z")
+QUATERNION = ("quat_w", "quat_x", "quat_y", "quat_z")
+VELOCITY = ("vel_x", "vel_y", "vel_z")
+Loader = Callable[[str, "Sequence[str] | None"], "pl.DataFrame | None"]
+
+
+def joined(spans: IntArray) -> IntArray:
+    """Return stretches (k, 2) in order, those that overlap or touch as one."""
+    spans = np.asarray(spans, np.int64).reshape(-1, 2)
+    spans = spans[np.argsort(spans[:, 0], kind="stable")]
+    if not len(spans):
+        return spans
+    last = np.maximum.accumulate(spans[:, 1])
+    new = np.r_[True, spans[1:, 0] > last[:-1]]
+    return np.column_stack((spans[new, 0], last[np.r_[np.flatnonzero(new)[1:] - 1, len(spans) - 1]]))
+
+
+def inside(t_ns: IntArray, spans: IntArray) -> NDArray[np.bool_]:
+    """Return which times (n,) lie in stretches (k, 2) that are half open, apart and in order."""
+    if not len(spans):
+        return np.zeros(len(t_ns), bool)
+    k = np.searchsorted(spans[:, 0], t_ns, side="right") - 1
+    return (k >= 0) & (t_ns < spans[np.maximum(k, 0), 1])
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Positions over time, with orientation where it is known.
+
+    Attributes
+    ----------
+    t_ns : ndarray of int64, shape (n,)
+        Strictly ascending.
+    position : ndarray, shape (n, 3)
+        Metres, finite.
+    quat_wxyz : ndarray, shape (n, 4), or None
+        Body to navigation frame.
+    """
+
+    t_ns: IntArray
+    position: FloatArray
+    quat_wxyz: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @cached_property
+    def yaw(self) -> FloatArray | None:
+        """Heading in radians, shape (n,)."""
+        return None if self.quat_wxyz is None else yaw_of(self.quat_wxyz)
+
+
+def track_of(table: pl.DataFrame | None) -> Trajectory | None:
+    """Return the usable rows of a pose table, in time order, or None where there are none."""
+    if table is None or not set(POSITION) <= set(table.columns):
+        return None
+    finite = pl.all_horizontal(pl.col(POSITION).is_finite())
+    if not table.select(finite.all()).item():
+        table = table.filter(finite)
+    if not (np.diff(table["t_ns"].to_numpy()) > 0).all():
+        table = table.sort("t_ns", maintain_order=True).unique("t_ns", keep="first", maintain_order=True)
+    if table.is_empty():
+        return None
+    quat = table.select(QUATERNION).to_numpy() if set(QUATERNION) <= set(table.columns) else None
+    if quat is not None and not np.isfinite(quat).all():
+        quat = None
+    return Trajectory(table["t_ns"].to_numpy(), table.select(POSITION).to_numpy(order="c"), quat)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is known of a walk beside its reference.
+
+    Attributes
+    ----------
+    closed : bool or None
+        Whether it ends where it began; None where that is not known.
+    length_m : float or None
+        Its length.
+    steps : float or None
+        Number of its steps.
+    """
+
+    closed: bool | None = None
+    length_m: float | None = None
+    steps: float | None = None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """An estimate beside a reference, after alignment.
+
+    Attributes
+    ----------
+    t_ns : ndarray of int64, shape (n,)
+        Stamps compared: the estimate's, or the reference's where that is the sparser one (surveyed points).
+    estimate, reference : ndarray, shape (n, 3)
+        Positions in metres in the reference's frame.
+    yaw_error : ndarray, shape (n,), or None
+        Heading of the estimate minus that of the reference, radians; None where one has no orientation.
+    transform : Transform
+        The alignment.
+    matches : Matches
+        What was matched and dropped.
+    on_estimate : bool
+        Whether the stamps are the estimate's.
+    yaw_start : float
+        ``yaw_error`` where the comparison of the whole walk begins.
+    dropped_ns : ndarray of int64
+        Stamps without a partner.
+    """
+
+    t_ns: IntArray
+    estimate: FloatArray
+    reference: FloatArray
+    yaw_error: FloatArray | None
+    transform: Transform
+    matches: Matches
+    on_estimate: bool
+    yaw_start: float = 0.0
+    dropped_ns: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
+
+    def within(self, spans: IntArray) -> Comparison | None:
+        """Return what lies in stretches of time, under the same alignment; None where nothing does."""
+        keep = inside(self.t_ns, spans)
+        if not keep.any():
+            return None
+        lost = self.dropped_ns[inside(self.dropped_ns, spans)]
+        m = self.matches
+        return replace(
+            self,
+            t_ns=self.t_ns[keep],
+            estimate=self.estimate[keep],
+            reference=self.reference[keep],
+            yaw_error=None if self.yaw_error is None else self.yaw_error[keep],
+            matches=replace(
+                m, index=m.index[keep], left=m.left[keep], weight=m.weight[keep], dropped=len(lost)
+            ),
+            dropped_ns=lost,
+        )
+
+    @property
+    def error(self) -> FloatArray:
+        """Estimate minus reference, shape (n, 3)."""
+        return self.estimate - self.reference
+
+
+@dataclass(frozen=True)
+class RunView:
+    """Everything that a metric may look at.
+
+    Attributes
+    ----------
+    run, estimator : str
+        Id and name.
+    lineage : mapping
+        The metadata record ``run/<id>``.
+    output : callable
+        ``output("pose", columns)`` is the table of that output with ``t_ns`` and those of ``columns``
+        (None: all) that it has; None where the run does not have the output.
+    truth : Truth
+        What is known of the walk.
+    reference, reference_velocity : polars.DataFrame or None
+        Tables of the reference track (poses or positions), in the recording's columns.
+    recording : Recording or None
+        For raw channels, further references, annotations and attachments: see :meth:`raw`,
+        :meth:`reference_table`, :attr:`annotations`.
+    chosen_reference : str or None
+        Topic that the user named.
+    alignment : str
+        See :func:`marcha.replay.alignment.align`.
+    max_gap_s : float
+        Reference samples farther apart are not interpolated between.
+    spans : ndarray of int64, shape (k, 2), or None
+        Stretches of time that are looked at: half open, apart, in order. None: all.
+    whole : RunView or None
+        Of a part: the view of the whole walk, whose alignment holds.
+    """
+
+    run: str
+    estimator: str
+    lineage: Mapping[str, str]
+    output: Loader
+    truth: Truth = Truth()
+    reference: pl.DataFrame | None = None
+    reference_velocity: pl.DataFrame | None = None
+    recording: Recording | None = None
+    chosen_reference: str | None = None
+    alignment: str = "se3"
+    max_gap_s: float = 0.1
+    spans: IntArray | None = None
+    whole: RunView | None = None
+    _cache: dict[Any, pl.DataFrame | None] = field(default_factory=dict, repr=False)
+    _comparisons: dict[str, Comparison | None] = field(default_factory=dict, repr=False)
+
+    def table(self, name: str, columns: tuple[str, ...] | None = None) -> pl.DataFrame | None:
+        """Return an output's table within the interval; naming ``columns`` saves memory."""
+        if (name, columns) not in self._cache:
+            self._cache[name, columns] = self.output(name, columns)
+        return self._within(self._cache[name, columns])
+
+    @property
+    def inputs(self) -> dict[str, tuple[str, ...]]:
+        """Topics by the name of the run's input."""
+        found = json.loads(self.lineage.get("inputs", "{}"))
+        return {name: tuple(topics) for name, topics in found.items()} if isinstance(found, dict) else {}
+
+    @property
+    def output_schemas(self) -> dict[str, str]:
+        """Message types by the name of the run's output, where a recording holds them."""
+        if self.recording is None:
+            return {}
+        start = f"/estimate/{self.run}/"
+        channels = self.recording.channels.items()
+        return {t.removeprefix(start): c.schema for t, c in channels if t.startswith(start)}
+
+    def raw(self, topic: str) -> pl.DataFrame | None:
+        """Return a channel of the recording within the interval; None where it is not there."""
+        if self.recording is None or topic not in self.recording.channels:
+            return None
+        return self._within(self.recording.table(topic))
+
+    def reference_table(self, kind: str) -> pl.DataFrame | None:
+        """Return the run's reference of a kind (``pose``, ``position``, ``fix``, ``joint``, ``steps`` …) within
+        the interval; None where there is none.
+        """
+        if self.recording is None:
+            return self._within(self.reference) if kind == "pose" else None
+        topic = reference_of(
+            self.recording.channels,
+            kind,
+            self.lineage.get("input", ""),
+            self.chosen_reference,
+            str(self.recording.path),
+        )
+        return None if topic is None else self.raw(topic)
+
+    def reference_tables(self, kind: str) -> dict[str, pl.DataFrame]:
+        """Return all references of a kind within the interval, by topic (one a segment, say)."""
+        if self.recording is None:
+            return {}
+        found = {t: self.raw(t) for t in references(self.recording.channels, kind)}
+        return {t: table for t, table in found.items() if table is not None}
+
+    @property
+    def annotations(self) -> pl.DataFrame:
+        """All annotations of the recording."""
+        return self.recording.annotations if self.recording is not None else pl.DataFrame()
+
+    def attachment(self, name: str) -> bytes | None:
+        """Return an attachment of the recording; None where it is not there."""
+        if self.recording is None or name not in [a.name for a in self.recording.attachments]:
+            return None
+        return self.recording.attachment(name)
+
+    def _within(self, table: pl.DataFrame | None) -> pl.DataFrame | None:
+        if table is None or self.spans is None:
+            return table
+        return table.filter(pl.Series(inside(table["t_ns"].to_numpy(), self.spans), dtype=pl.Boolean))
+
+    def part(self, spans: IntArray) -> RunView:
+        """Return the same view of stretches of time (k, 2), half open; those that overlap are joined.
+
+        The alignment stays that of the whole walk. What is known of the walk (closed, its length) says nothing
+        of a part of it.
+        """
+        return replace(self, spans=joined(spans), whole=self.whole or self, truth=Truth())
+
+    @property
+    def scattered(self) -> bool:
+        """Whether several stretches are looked at, so that there is no first and last."""
+        return self.spans is not None and len(self.spans) > 1
+
+    @cached_property
+    def track(self) -> Trajectory | None:
+        """The estimated track: of the output ``pose``, else of ``position``."""
+        headings = QUATERNION if self.reference is not None else ()
+        track = track_of(self.table("pose", (*POSITION, *headings)))
+        return track if track is not None else track_of(self.table("position", POSITION))
+
+    @cached_property
+    def reference_track(self) -> Trajectory | None:
+        """The reference track."""
+        return track_of(self._within(self.reference))
+
+    @cached_property
+    def comparison(self) -> Comparison | None:
+        """The estimate beside the reference under the view's alignment; None where nothing matches."""
+        return self.compared(self.alignment)
+
+    def compared(self, alignment: str) -> Comparison | None:
+        """Return the estimate beside the reference under an alignment of the whole walk."""
+        if self.whole is not None:
+            found = self.whole.compared(alignment)
+            return None if found is None or self.spans is None else found.within(self.spans)
+        if alignment not in self._comparisons:
+            self._comparisons[alignment] = compare(self, alignment)
+        return self._comparisons[alignment]
+
+    @cached_property
+    def stances(self) -> IntArray:
+        """Stances as ``[first still, last still]`` times, shape (n, 2)."""
+        table = self.table("stance")
+        if table is None or table.is_empty():
+            return np.empty((0, 2), np.int64)
+        t_ns, still = table["t_ns"].to_numpy(), table["still"].cast(pl.Int8).to_numpy()
+        edges = np.diff(still, prepend=np.int8(0), append=np.int8(0))
+        first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
+        return np.column_stack((t_ns[first], t_ns[last]))
+
+
+def compare(view: RunView, alignment: str) -> Comparison | None:
+    """Match a run's track with the reference and align it."""
+    track, reference = view.track, view.reference_track
+    if track is None or reference is None:
+        return None
+    sparse = len(reference) > 1 and float(np.median(np.diff(reference.t_ns))) > view.max_gap_s * 1e9
+    kept, other = (reference, track) if sparse else (track, reference)
+    found = match(kept.t_ns, other.t_ns, view.max_gap_s)
+    if not len(found.index):
+        return None
+    here, there = kept.position[found.index], found.linear(other.position)
+    yaw_error = None
+    yaws: tuple[FloatArray, FloatArray] | None = None
+    if kept.yaw is not None and other.yaw is not None:
+        pair = (kept.yaw[found.index], found.angle(other.yaw))
+        yaws = (pair[1], pair[0]) if sparse else pair
+    estimate, truth = (there, here) if sparse else (here, there)
+    start = (float(yaws[0][0]), float(yaws[1][0])) if yaws is not None else (None, None)
+    transform = align(estimate, truth, alignment, *start)
+    if yaws is not None:
+        yaw_error = wrap(yaws[0] + transform.yaw - yaws[1])
+    return Comparison(
+        kept.t_ns[found.index],
+        transform.points(estimate),
+        truth,
+        yaw_error,
+        transform,
+        found,
+        not sparse,
+        float(yaw_error[0]) if yaw_error is not None else 0.0,
+        np.delete(kept.t_ns, found.index),
+    )
