@@ -1,7 +1,7 @@
 """From the tidy table of cells to groups, outliers and families of comparisons.
 
-A value is left out as an outlier once, in the finest group it belongs to (filter × detector × configuration),
-and stays out of every pooled group.
+A value is left out as an outlier once, in the finest group it belongs to (filter × the study's factors ×
+configuration), and stays out of every pooled group.
 """
 
 from __future__ import annotations
@@ -23,16 +23,30 @@ from .statistics import (
     summarize,
 )
 
-#: What a group is made of; an empty string in a table stands for "all of them together".
-FACTORS = ("filter", "detector", "configuration")
 SUBSETS = ("all", "unclipped", "clipped")
+
+
+def factors(config: cfg.StudyConfig) -> tuple[str, ...]:
+    """Return what a group is made of; an empty string in a table stands for "all of them together"."""
+    return ("filter", *cfg.factor_names(config), "configuration")
+
+
+def base_levels(levels: dict[str, list[str]], config: cfg.StudyConfig) -> dict[str, str]:
+    """Return the first level of every factor: the one that stands for it where others are compared."""
+    return {name: levels[name][0] if levels[name] else "" for name in cfg.factor_names(config)}
+
+
+def at_base(base: dict[str, str]) -> list[pl.Expr]:
+    """Return what picks the rows at these levels, those of filters that are not part of a factor included."""
+    return [pl.col(name).is_in([level, ""]) for name, level in base.items()]
 
 
 def values(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     """Return one row a finished cell and metric: its value in the metric's unit, and if it is an outlier.
 
-    Columns: ``metric, unit, filter, detector, configuration, recording, input, clipped, value, outlier``.
+    Columns: ``metric, unit, filter``, the factors, ``configuration, recording, input, clipped, value, outlier``.
     """
+    of = factors(config)
     done = table.filter(pl.col("status") == "ok")
     frames: list[pl.DataFrame] = []
     for metric in config.metrics:
@@ -43,19 +57,19 @@ def values(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
             done.select(
                 pl.lit(cfg.metric_title(metric)).alias("metric"),
                 pl.lit(metric.unit).alias("unit"),
-                *(pl.col(c) for c in (*FACTORS, "recording", "input", "clipped")),
+                *(pl.col(c) for c in (*of, "recording", "input", "clipped")),
                 (value.abs() if metric.absolute else value).alias("value"),
             )
         )
     if not frames:
         return pl.DataFrame(
-            schema=dict.fromkeys(["metric", "unit", *FACTORS, "recording", "input"], pl.String)
+            schema=dict.fromkeys(["metric", "unit", *of, "recording", "input"], pl.String)
         ).with_columns(clipped=pl.lit(False), value=pl.lit(0.0), outlier=pl.lit(False))
     sigma = config.statistics.outlier_sigma
     return pl.concat(frames).with_columns(
         pl.col("value")
         .map_batches(lambda s: pl.Series(outlier_mask(s.to_numpy(), sigma)), return_dtype=pl.Boolean)
-        .over("metric", *FACTORS)
+        .over("metric", *of)
         .alias("outlier")
     )
 
@@ -63,13 +77,13 @@ def values(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
 def order(frame: pl.DataFrame, config: cfg.StudyConfig) -> dict[str, list[str]]:
     """Return the levels of every factor in the order in which they are shown."""
     methods = cfg.methods(config)
-    present = {f: set(frame[f].to_list()) for f in FACTORS}
-    known = {
+    present = {f: set(frame[f].to_list()) for f in factors(config)}
+    listed = {
         "filter": dict.fromkeys(m.label for m in methods),
-        "detector": dict.fromkeys(m.detector for m in methods),
+        **{f: dict.fromkeys(m.levels[f] for m in methods) for f in cfg.factor_names(config)},
         "configuration": dict.fromkeys(sorted(present["configuration"])),
     }
-    return {f: [level for level in known[f] if level in present[f]] for f in FACTORS}
+    return {f: [level for level in listed[f] if level in present[f]] for f in factors(config)}
 
 
 def _subset(frame: pl.DataFrame, subset: str) -> pl.DataFrame:
@@ -79,13 +93,14 @@ def _subset(frame: pl.DataFrame, subset: str) -> pl.DataFrame:
 
 
 def groups(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
-    """Summarize every metric by filter, configuration and detector, for all, unclipped and clipped inputs.
+    """Summarize every metric by filter, factors and configuration, for all, unclipped and clipped inputs.
 
     Columns: ``metric, unit, subset``, the factors (empty where pooled) and the fields of
     :class:`~marcha.study.statistics.GroupSummary`.
     """
     rows: list[dict[str, Any]] = []
-    pooled = [FACTORS, ("filter", "detector"), ("configuration", "detector")]
+    names = cfg.factor_names(config)
+    pooled = [factors(config), ("filter", *names), ("configuration", *names)]
     subsets = SUBSETS if frame["clipped"].n_unique() > 1 else SUBSETS[:1]
     for subset in subsets:
         part = _subset(frame, subset)
@@ -99,7 +114,7 @@ def groups(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
                         "metric": key[0],
                         "unit": key[1],
                         "subset": subset,
-                        **dict.fromkeys(FACTORS, ""),
+                        **dict.fromkeys(factors(config), ""),
                         **dict(zip(by, key[2:], strict=True)),
                         **msgspec.structs.asdict(summary),
                     }
@@ -108,14 +123,14 @@ def groups(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
         f.name: pl.String if f.name == "note" else pl.Float64 for f in msgspec.structs.fields(GroupSummary)
     }
     fields |= dict.fromkeys(("n", "outliers", "missing"), pl.Int64)
-    schema = {**dict.fromkeys(("metric", "unit", "subset", *FACTORS), pl.String), **fields}
+    schema = {**dict.fromkeys(("metric", "unit", "subset", *factors(config)), pl.String), **fields}
     return pl.DataFrame(rows, schema=schema)
 
 
-def outliers(frame: pl.DataFrame) -> pl.DataFrame:
+def outliers(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     """Return the values that were left out."""
     return frame.filter(pl.col("outlier")).select(
-        "metric", *FACTORS, "recording", "input", "value", "unit", "clipped"
+        "metric", *factors(config), "recording", "input", "value", "unit", "clipped"
     )
 
 
@@ -123,19 +138,20 @@ def comparisons(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     """Compare every pair of levels of one factor, family by family.
 
     Families, each corrected by Holm on its own: filters within each configuration and pooled; configurations
-    within each filter and pooled (both with the study's first detector); detectors within each filter ×
-    configuration.
+    within each filter and pooled (both at the first level of every factor); the levels of each factor within
+    each filter × configuration (the other factors at their first).
 
     Columns: ``metric, unit, factor`` (what is compared), ``within`` (what is held fixed), ``a, b`` and the
     fields of :class:`~marcha.study.statistics.GroupComparison`.
     """
     frame = frame.filter(~pl.col("outlier") & pl.col("value").is_finite())
     levels = order(frame, config)
-    first = levels["detector"][0] if levels["detector"] else ""
+    base = base_levels(levels, config)
     rows: list[dict[str, Any]] = []
     for (metric, unit), part in frame.group_by("metric", "unit", maintain_order=True):
-        for factor, fixed in _families(levels, first):
-            family = part.filter(*(pl.col(k) == v for k, v in fixed.items()))
+        for factor, fixed in _families(levels, base):
+            held = {k: v for k, v in fixed.items() if k in base}
+            family = part.filter(*(pl.col(k) == v for k, v in fixed.items() if k not in base), *at_base(held))
             samples = {
                 level: family.filter(pl.col(factor) == level)["value"].to_numpy() for level in levels[factor]
             }
@@ -173,9 +189,8 @@ def comparisons(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=schema)
 
 
-def _families(levels: dict[str, list[str]], first: str) -> Iterator[tuple[str, dict[str, str]]]:
+def _families(levels: dict[str, list[str]], base: dict[str, str]) -> Iterator[tuple[str, dict[str, str]]]:
     """Yield (factor that is compared, levels that are held fixed)."""
-    base = {"detector": first}
     for factor, other in (("filter", "configuration"), ("configuration", "filter")):
         if len(levels[factor]) < 2:
             continue
@@ -183,20 +198,23 @@ def _families(levels: dict[str, list[str]], first: str) -> Iterator[tuple[str, d
             yield factor, {other: level, **base}
         if len(levels[other]) > 1:
             yield factor, base
-    if len(levels["detector"]) > 1:
+    for factor in base:
+        if len(levels[factor]) < 2:
+            continue
+        others = {name: level for name, level in base.items() if name != factor}
         for label in levels["filter"]:
             for configuration in levels["configuration"]:
-                yield "detector", {"filter": label, "configuration": configuration}
+                yield factor, {"filter": label, "configuration": configuration, **others}
 
 
 def beside_published(group_table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     """Put published means beside the measured ones.
 
-    Columns: ``table, by, metric, unit, filter, detector, configuration, published, published_sd, measured,
-    measured_sd, n, ratio, origin, note``. Measured values are NaN where the study has none.
+    Columns: ``table, by, metric, unit, filter``, the factors, ``configuration, published, published_sd,
+    measured, measured_sd, n, ratio, origin, note``. Measured values are NaN where the study has none.
     """
     measured = {
-        (r["metric"], r["filter"], r["detector"], r["configuration"]): r
+        (r["metric"], *(r[f] for f in factors(config))): r
         for r in group_table.filter((pl.col("subset") == "all") & (pl.col("configuration") != "")).iter_rows(
             named=True
         )
@@ -206,9 +224,11 @@ def beside_published(group_table: pl.DataFrame, config: cfg.StudyConfig) -> pl.D
     for table in config.published:
         for row_label, cells in table.rows.items():
             label = row_label if table.by == "estimator" else table.estimator
-            detector = row_label if table.by == "detector" else table.detector
+            levels = {name: table.levels.get(name, "") for name in cfg.factor_names(config)}
+            if table.by != "estimator":
+                levels[table.by] = row_label
             for configuration, value in cells.items():
-                found = measured.get((table.metric, label, detector, configuration))
+                found = measured.get((table.metric, label, *levels.values(), configuration))
                 sd = table.sd.get(row_label, {}).get(configuration)
                 published = value * table.scale
                 rows.append(
@@ -218,7 +238,7 @@ def beside_published(group_table: pl.DataFrame, config: cfg.StudyConfig) -> pl.D
                         "metric": table.metric,
                         "unit": units[table.metric],
                         "filter": label,
-                        "detector": detector,
+                        **levels,
                         "configuration": configuration,
                         "published": published,
                         "published_sd": None if sd is None else sd * table.scale,
@@ -232,7 +252,7 @@ def beside_published(group_table: pl.DataFrame, config: cfg.StudyConfig) -> pl.D
                 )
     floats = ("published", "published_sd", "measured", "measured_sd")
     schema = {
-        **dict.fromkeys(("table", "by", "metric", "unit", *FACTORS), pl.String),
+        **dict.fromkeys(("table", "by", "metric", "unit", *factors(config)), pl.String),
         **dict.fromkeys(floats, pl.Float64),
         "n": pl.Int64,
         "ratio": pl.Float64,
@@ -256,7 +276,7 @@ NEES = {"nees_position_end": 3, "nees_velocity_end": 3}
 def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     """Test every filter's covariance: mean NEES over walks against its chi-square interval.
 
-    Columns: ``metric, filter, detector, configuration`` (empty: all of the same ``clipped``), ``clipped``
+    Columns: ``metric, filter``, the factors, ``configuration`` (empty: all of the same ``clipped``), ``clipped``
     (apart, since no filter can know what a sensor did beyond its full scale), ``n, mean, median, low, high,
     verdict``.
     """
@@ -266,7 +286,7 @@ def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
         if name not in done.columns:
             continue
         known = done.filter(pl.col(name).is_finite())
-        for by in (("clipped", "filter", "detector"), ("clipped", *FACTORS)):
+        for by in (("clipped", "filter", *cfg.factor_names(config)), ("clipped", *factors(config))):
             for key, part in known.group_by(*by, maintain_order=True):
                 mean, n = float(part[name].mean()), part.height  # pyright: ignore[reportArgumentType]
                 low, high = nees_bounds(n, dof, config.statistics.confidence)
@@ -276,7 +296,7 @@ def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
                 rows.append(
                     {
                         "metric": name,
-                        **dict.fromkeys(FACTORS, ""),
+                        **dict.fromkeys(factors(config), ""),
                         **dict(zip(by, key, strict=True)),
                         "n": n,
                         "mean": mean,
@@ -287,7 +307,7 @@ def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
                     }
                 )
     schema = {
-        **dict.fromkeys(("metric", *FACTORS), pl.String),
+        **dict.fromkeys(("metric", *factors(config)), pl.String),
         "clipped": pl.Boolean,
         "n": pl.Int64,
         **dict.fromkeys(("mean", "median", "low", "high"), pl.Float64),
@@ -298,11 +318,13 @@ def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
 
 def remarks(cells: Sequence[Any], config: cfg.StudyConfig) -> list[str]:
     """Return what a reader must know before the numbers: failed cells, metrics that no cell has."""
-    notes = [
-        f"failed: {c.recording}{f' {c.input}' if c.input else ''}, {c.label} {c.detector}: {c.error}"
-        for c in cells
-        if c.status != "ok"
-    ]
+    notes: list[str] = []
+    for c in (c for c in cells if c.status != "ok"):
+        where, method = (
+            f"{c.recording} {c.input}".strip(),
+            " ".join(filter(None, (c.label, *c.levels.values()))),
+        )
+        notes.append(f"failed: {where}, {method}: {c.error}")
     if len(notes) > 12:
         notes = [*notes[:12], f"{len(notes) - 12} more cells failed; `error` in results.csv says why"]
     have = {name for c in cells for name in c.metrics} | {"run_time_s", "samples", "clipped_readings"}

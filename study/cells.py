@@ -47,8 +47,10 @@ class StudyCell(msgspec.Struct, frozen=True):
         Key of the job.
     recording, configuration, input : str
         Recording's name, its configuration, topic; the topic is empty where the job failed before it had one.
-    estimator, label, detector, preset, params : str
+    estimator, label, preset, params : str
         The method; ``params`` as JSON.
+    levels : dict of str to str
+        Its level of every factor.
     status : str
         ``ok`` or ``failed``.
     error : str
@@ -77,7 +79,7 @@ class StudyCell(msgspec.Struct, frozen=True):
     estimator: str
     label: str
     configuration: str = ""
-    detector: str = ""
+    levels: dict[str, str] = {}
     preset: str = ""
     params: str = "{}"
     status: str = "ok"
@@ -142,7 +144,7 @@ def _cell(job: Job, source: StudyRecording, **values: Any) -> StudyCell:
         input=values.pop("input", ""),
         estimator=method.estimator,
         label=method.label,
-        detector=method.detector,
+        levels=method.levels,
         preset=method.preset,
         params=values.pop("params", msgspec.json.encode(method.params).decode()),
         **values,

@@ -25,6 +25,14 @@ NonNegative = Annotated[int, msgspec.Meta(ge=0)]
 _PACKAGE = __name__.rpartition(".")[0]
 
 Positive = Annotated[int, msgspec.Meta(ge=1)]
+Level = str | bool | int | float
+"""Value of a parameter that is a factor."""
+
+RESERVED = (
+    *("metric", "unit", "filter", "configuration", "recording", "input", "estimator", "preset", "params"),
+    *("status", "error", "clipped", "value"),
+)
+"""Columns of the tables that no factor may be called by."""
 
 
 class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, omit_defaults=False):
@@ -129,15 +137,15 @@ class Estimators(_Table, frozen=True, kw_only=True):
         Named parameter sets of the estimator, one variant each; the empty name stands for its defaults.
     params : dict
         Parameters. A list is a grid axis; give a list of lists for a parameter that is itself a list.
-    detectors : list of str or None
-        Replaces the study's detectors for this estimator.
+    factors : dict of str to list
+        Replaces the levels of the study's factors for this estimator; an empty list takes it out of one.
     """
 
     name: str
     label: str = ""
     presets: list[str] = msgspec.field(default_factory=lambda: [""])
     params: dict[str, Any] = {}
-    detectors: list[str] | None = None
+    factors: dict[str, list[Level]] = {}
 
 
 class Metric(_Table, frozen=True, kw_only=True):
@@ -211,9 +219,11 @@ class Published(_Table, frozen=True, kw_only=True):
     rows : dict of str to dict of str to float
         Row label to column label to published mean.
     by : str
-        What the rows are, ``estimator`` or ``detector``; the columns are configurations.
-    detector, estimator : str
-        What the table holds fixed; empty where it is the row.
+        What the rows are, ``estimator`` or a factor; the columns are configurations.
+    estimator : str
+        Estimator that the table holds fixed; empty where it is the row.
+    levels : dict of str to str
+        Levels of the factors that the table holds fixed.
     sd : dict
         Published standard deviations, same shape.
     table : str
@@ -226,9 +236,9 @@ class Published(_Table, frozen=True, kw_only=True):
     origin: str
     rows: dict[str, dict[str, float]]
     scale: float = 1.0
-    by: Literal["estimator", "detector"] = "estimator"
+    by: str = "estimator"
     estimator: str = ""
-    detector: str = ""
+    levels: dict[str, str] = {}
     sd: dict[str, dict[str, float]] = {}
     table: str = ""
     note: str = ""
@@ -250,10 +260,10 @@ class StudyConfig(_Table, frozen=True, kw_only=True):
         and rules are searched in its name.
     estimators : list of Estimators
         What runs.
-    detectors : list of str
-        Values of every estimator's ``detector`` parameter, or names of its presets that set one
-        (``shoe-tuned``). The first is the one that tables and tests between estimators use. Empty keeps the
-        estimators' default.
+    factors : dict of str to list
+        Parameters that every estimator is run with several values of: name to the values, or to names of the
+        estimators' presets that set one (``detector = ["shoe", "shoe-tuned"]``). The first is the level that
+        tables and tests between estimators use. A parameter that is not named keeps the estimators' default.
     metrics : list of Metric
         What is tabulated and tested. Every metric is in ``results.parquet`` anyway.
     tracks : bool
@@ -270,7 +280,7 @@ class StudyConfig(_Table, frozen=True, kw_only=True):
     inputs: list[str] = msgspec.field(default_factory=lambda: ["*"])
     configurations: list[Grouping] = []
     estimators: list[Estimators]
-    detectors: list[str] = []
+    factors: dict[str, list[Level]] = {}
     metrics: list[Metric] = msgspec.field(default_factory=lambda: list(USUAL_METRICS))
     statistics: Statistics = Statistics()
     published: list[Published] = []
@@ -287,17 +297,17 @@ class Method(msgspec.Struct, frozen=True):
         Registered name.
     label : str
         The filter's name in tables, with what varies in the grid (``9IEZ sigma_acc=0.1``).
-    detector : str
-        Detector; empty where the study names none.
+    levels : dict of str to str
+        Level of every factor of the study; empty where the estimator is not part of it.
     preset : str
         Named parameter set that ``params`` override.
     params : dict
-        Parameters, the detector included.
+        Parameters, those of the factors included.
     """
 
     estimator: str
     label: str
-    detector: str = ""
+    levels: dict[str, str] = {}
     preset: str = ""
     params: dict[str, Any] = {}
 
@@ -365,11 +375,15 @@ def check(config: StudyConfig, name: str) -> StudyConfig:
         for key, value in e.params.items():
             if isinstance(value, list) and not value:
                 raise no(f"{e.name}: parameter {key} has an empty list of values")
-        if "detector" in e.params and (config.detectors or e.detectors):
-            raise no(f"{e.name}: give `detector` either in params or in `detectors`")
+        for factor, levels in _levels(config, e).items():
+            if factor in e.params and levels != [""]:
+                raise no(f"{e.name}: give `{factor}` either in params or in `factors`")
+    for factor in factor_names(config):
+        if factor in RESERVED:
+            raise no(f"factor {factor!r} is the name of a column of the results")
     for key, count in Counter(method_id(m) for m in _grid(config)).items():
         if count > 1:
-            raise no(f"{key[0]} with detector {key[1]!r} occurs twice; give one of them another label")
+            raise no(f"{' '.join(filter(None, key))} occurs twice; give one of them another label")
     titles = [metric_title(m) for m in config.metrics]
     for title in titles:
         if titles.count(title) > 1:
@@ -377,6 +391,9 @@ def check(config: StudyConfig, name: str) -> StudyConfig:
     for table in config.published:
         if table.metric not in titles:
             raise no(f"published: metric {table.metric!r} is none of {', '.join(titles)}")
+        for factor in (table.by, *table.levels):
+            if factor not in ("estimator", *factor_names(config)):
+                raise no(f"published: {factor!r} is neither `estimator` nor a factor of this study")
     if config.simulate and not config.simulate.scenarios:
         raise no("simulate: no scenarios")
     return config
@@ -387,46 +404,61 @@ def metric_title(metric: Metric) -> str:
     return metric.title or metric.column
 
 
-def method_id(method: Method) -> tuple[str, str]:
-    """Return (filter label, detector), which name a method in tables."""
-    return method.label, method.detector
+def factor_names(config: StudyConfig) -> tuple[str, ...]:
+    """Return the names of the study's factors: columns of its tables between filter and configuration."""
+    return tuple(dict.fromkeys([*config.factors, *(name for e in config.estimators for name in e.factors)]))
+
+
+def _levels(config: StudyConfig, entry: Estimators) -> dict[str, list[Level]]:
+    """Return the levels of every factor that an estimator runs at; [""] where it is not part of one."""
+    chosen = {**config.factors, **entry.factors}
+    return {name: chosen.get(name) or [""] for name in factor_names(config)}
+
+
+def method_id(method: Method) -> tuple[str, ...]:
+    """Return the filter's label and the level of every factor, which name a method in tables."""
+    return method.label, *method.levels.values()
 
 
 def methods(config: StudyConfig) -> list[Method]:
-    """Return every estimator × preset × parameters × detector, in the order of the configuration."""
-    return [
-        m
-        if "detector" in m.params
-        else msgspec.structs.replace(m, params={**m.params, **_choice(m.estimator, m.detector)})
-        for m in _grid(config)
-    ]
+    """Return every estimator × preset × parameters × factors, in the order of the configuration."""
+    done: list[Method] = []
+    for method in _grid(config):
+        params = dict(method.params)
+        for name, level in method.levels.items():
+            if level:
+                params |= _choice(config, method.estimator, name, level)
+        done.append(msgspec.structs.replace(method, params=params))
+    return done
 
 
 def _grid(config: StudyConfig) -> Iterator[Method]:
-    """Yield the methods before their detectors are looked up, which would import the estimators."""
+    """Yield the methods before levels that are presets are looked up, which would import the estimators."""
     for entry in config.estimators:
         axes = {k: v if isinstance(v, list) else [v] for k, v in entry.params.items()}
         varying = [k for k, v in axes.items() if len(v) > 1]
-        detectors = (config.detectors if entry.detectors is None else entry.detectors) or [""]
+        levels = _levels(config, entry)
         for preset, values in itertools.product(entry.presets or [""], itertools.product(*axes.values())):
             params = dict(zip(axes, values, strict=True))
             label = " ".join(
                 [
                     entry.label or entry.name,
                     *([preset] if len(entry.presets) > 1 and preset else []),
-                    *(f"{k}={params[k]}" for k in varying if k != "detector"),
+                    *(f"{k}={params[k]}" for k in varying),
                 ]
             )
-            for detector in [str(params["detector"])] if "detector" in params else detectors:
-                yield Method(entry.name, label, detector, preset, params)
+            for chosen in itertools.product(*levels.values()):
+                at = dict(zip(levels, map(str, chosen), strict=True))
+                yield Method(entry.name, label, at, preset, params)
 
 
-def _choice(estimator: str, detector: str) -> dict[str, Any]:
-    """Return the parameters that choose a detector, given by name or by a preset that sets one."""
-    if not detector:
-        return {}
-    known = getattr(available().get(estimator), "presets", {})
-    return known[detector] if "detector" in known.get(detector, {}) else {"detector": detector}
+def _choice(config: StudyConfig, estimator: str, name: str, level: str) -> dict[str, Any]:
+    """Return the parameters of a factor's level: its value, or a preset of the estimator that sets it."""
+    presets_of = getattr(available().get(estimator), "presets", {})
+    if name in presets_of.get(level, {}):
+        return presets_of[level]
+    levels = (*config.factors.get(name, ()), *(v for e in config.estimators for v in e.factors.get(name, ())))
+    return {name: next(value for value in levels if str(value) == level)}
 
 
 def configuration(config: StudyConfig, name: str, topic: str) -> str:

@@ -14,7 +14,7 @@ import polars as pl
 
 from ..viz.page import PagePicture
 from . import config as cfg
-from .analysis import order
+from .analysis import at_base, base_levels, order
 from .cells import StudyCell
 from .executors import Executor
 
@@ -44,45 +44,46 @@ def drawings(
 ) -> list[Drawing]:
     """Return all that the study has to show, in the order of the report; see :func:`draw`."""
     levels = order(frame, config)
-    first = levels["detector"][0] if levels["detector"] else ""
-    detector = f", detector {first}" if first else ""
-    found: list[Drawing] = []
+    base = base_levels(levels, config)
+    fixed = "".join(f", {name} {level}" for name, level in base.items() if level)
+    drawn: list[Drawing] = []
     for metric in config.metrics:
         title = cfg.metric_title(metric)
         whole = frame.filter((pl.col("metric") == title) & pl.col("value").is_finite())
-        part = whole.filter(pl.col("detector") == first)
+        part = whole.filter(*at_base(base))
         if not len(part):
             continue
         stem = re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
         section = "run time" if metric.column == "run_time_s" else "box"
         for factor in ("filter", "configuration"):
             if len(levels[factor]) > 1:
-                caption = f"{title} by {factor}, all other factors together{detector}."
+                caption = f"{title} by {factor}, all others together{fixed}."
                 arguments = (part, config, factor, metric.log)
-                found.append(Drawing(f"box-{stem}-{factor}", section, caption, "box_by", arguments))
+                drawn.append(Drawing(f"box-{stem}-{factor}", section, caption, "box_by", arguments))
         if len(levels["filter"]) > 1 and len(levels["configuration"]) > 1:
-            caption = f"{title} by configuration and filter{detector}."
+            caption = f"{title} by configuration and filter{fixed}."
             arguments = (part, config, metric.log)
-            found.append(Drawing(f"box-{stem}-both", section, caption, "box_by_both", arguments))
+            drawn.append(Drawing(f"box-{stem}-both", section, caption, "box_by_both", arguments))
         if section == "run time":
             continue
-        if len(levels["detector"]) > 1:
-            caption = f"{title} by detector, all filters and configurations together."
-            arguments = (whole, config, "detector", metric.log)
-            found.append(Drawing(f"box-{stem}-detector", section, caption, "box_by", arguments))
-        caption = f"{title}: ordered values against normal quantiles; on the line they are normal{detector}."
-        found.append(Drawing(f"qq-{stem}", "qq", caption, "qq", (part, config)))
-    own = [c for c in cells if c.detector == first]
+        for name in base:
+            if len(levels[name]) > 1:
+                caption = f"{title} by {name}, all filters and configurations together."
+                arguments = (whole, config, name, metric.log)
+                drawn.append(Drawing(f"box-{stem}-{name}", section, caption, "box_by", arguments))
+        caption = f"{title}: ordered values against normal quantiles; on the line they are normal{fixed}."
+        drawn.append(Drawing(f"qq-{stem}", "qq", caption, "qq", (part, config)))
+    own = [c for c in cells if all(c.levels[name] in (level, "") for name, level in base.items())]
     if config.tracks and own:
-        caption = f"Tracks seen from above: start at the cross, dots where they end{detector}."
+        caption = f"Tracks seen from above: start at the cross, dots where they end{fixed}."
         if any(c.clipped for c in own):
             caption += " Dashed: clipped input."
-        found.append(Drawing("tracks", "tracks", caption, "tracks", (own, config)))
-    single = nees.filter((pl.col("configuration") != "") & (pl.col("detector") == first))
+        drawn.append(Drawing("tracks", "tracks", caption, "tracks", (own, config)))
+    single = nees.filter(pl.col("configuration") != "", *at_base(base))
     if len(single):
-        caption = f"Mean NEES over the walks{detector}; above the band a filter is too sure of itself."
-        found.append(Drawing("consistency", "consistency", caption, "consistency", (single, config)))
-    return found
+        caption = f"Mean NEES over the walks{fixed}; above the band a filter is too sure of itself."
+        drawn.append(Drawing("consistency", "consistency", caption, "consistency", (single, config)))
+    return drawn
 
 
 def render(drawing: Drawing) -> PagePicture | None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from html import escape
-from itertools import product
 from typing import Any
 
 import msgspec
@@ -14,7 +14,7 @@ import polars as pl
 from ..replay.metrics import BETWEEN
 from ..viz.page import Html, PagePicture, number
 from . import config as cfg
-from .analysis import FACTORS, order
+from .analysis import base_levels, factors, order
 from .labels import label_means
 
 
@@ -81,7 +81,10 @@ def render(contents: ReportContents, pictures: Sequence[PagePicture]) -> str:
     levels = order(contents.values, contents.config)
     if len(contents.values):
         _means(html, contents, levels)
-        if len(levels["detector"]) > 1 or contents.values["clipped"].n_unique() > 1:
+        if (
+            any(len(levels[n]) > 1 for n in cfg.factor_names(contents.config))
+            or contents.values["clipped"].n_unique() > 1
+        ):
             _methods(html, contents, levels)
         for title, section in (("Box plots", "box"), ("Tracks", "tracks"), ("Run time", "run time")):
             _gallery(html, pictures, title, section)
@@ -100,14 +103,15 @@ def _introduction(html: Html, contents: ReportContents) -> None:
     results = contents.results
     if contents.config.description:
         html.text(contents.config.description)
+    names = cfg.factor_names(contents.config)
     walks, clipped = results["recording"].n_unique(), results.filter("clipped")["recording"].n_unique()
     done = results.filter(pl.col("status") == "ok")
     html.text(
         f"{_count(walks, 'recording')}, {_count(results['filter'].n_unique(), 'filter')}, "
-        f"{_count(results['detector'].n_unique(), 'detector')}; "
+        f"{''.join(_count(results.filter(pl.col(n) != '')[n].n_unique(), 'level') + f' of {n}, ' for n in names)}"
         f"{_count(len(done), 'finished cell')}, {len(results) - len(done)} failed; "
         f"{_count(clipped, 'recording')} with clipped inputs. "
-        f"A cell is one filter with one detector on one input of one recording."
+        f"A cell is one filter{' at one level of each factor' if names else ''} on one input of one recording."
     )
     html.warning(contents.notes)
 
@@ -116,17 +120,31 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def _lookup(groups: pl.DataFrame, subset: str = "all") -> dict[tuple[str, str, str, str], dict[str, Any]]:
-    part = groups.filter(pl.col("subset") == subset)
-    return {
-        (r["metric"], r["filter"], r["detector"], r["configuration"]): r for r in part.iter_rows(named=True)
-    }
+def _lookup(contents: ReportContents, subset: str = "all") -> dict[tuple[str, ...], dict[str, Any]]:
+    """Return the groups of a subset by metric, filter, levels of the factors and configuration."""
+    part = contents.groups.filter(pl.col("subset") == subset)
+    keys = ("metric", *factors(contents.config))
+    return {tuple(r[k] for k in keys): r for r in part.iter_rows(named=True)}
+
+
+def _combinations(contents: ReportContents, levels: dict[str, list[str]]) -> list[tuple[str, ...]]:
+    """Return every filter with every level of every factor."""
+    return list(itertools.product(*(levels[f] for f in ("filter", *cfg.factor_names(contents.config)))))
+
+
+def _levels_of(label: str, base: dict[str, str], config: cfg.StudyConfig) -> tuple[str, ...]:
+    """Return where a filter stands among others: at the first level of the factors that it is part of."""
+    for method in cfg.methods(config):
+        if method.label == label and all(method.levels[f] in (level, "") for f, level in base.items()):
+            return tuple(method.levels.values())
+    return tuple(base.values())
 
 
 def _means(html: Html, contents: ReportContents, levels: dict[str, list[str]]) -> None:
     html.section("Means by filter and configuration")
-    first = levels["detector"][0]
-    found = _lookup(contents.groups)
+    base = base_levels(levels, contents.config)
+    found = _lookup(contents)
+    levels_of = {name: _levels_of(name, base, contents.config) for name in levels["filter"]}
     shares = {
         (r["configuration"],): r["share"]
         for r in contents.results.group_by("configuration")
@@ -134,7 +152,7 @@ def _means(html: Html, contents: ReportContents, levels: dict[str, list[str]]) -
         .iter_rows(named=True)
     }
     beside = {
-        (r["metric"], r["filter"], r["detector"], r["configuration"]): r["published"]
+        (r["metric"], *(r[f] for f in factors(contents.config))): r["published"]
         for r in contents.published.filter(pl.col("by") == "estimator").iter_rows(named=True)
     }
     clipped = ", ".join(
@@ -142,7 +160,7 @@ def _means(html: Html, contents: ReportContents, levels: dict[str, list[str]]) -
     )
     html.text(
         "Mean ± standard deviation (n) without outliers"
-        + (f"; detector {first}" if first else "")
+        + "".join(f"; {name} {level}" for name, level in base.items() if level)
         + (f". Inputs that reached their full scale, by configuration: {clipped}." if clipped else ".")
     )
     for metric in contents.config.metrics:
@@ -155,24 +173,26 @@ def _means(html: Html, contents: ReportContents, levels: dict[str, list[str]]) -
         for name in levels["filter"]:
             row = [escape(name)]
             for c in levels["configuration"]:
-                group = found.get((title, name, first, c))
+                group = found.get((title, name, *levels_of[name], c))
                 n = f' <span class="note">({group["n"]})</span>' if group else ""
                 row.append(mean_sd(group) + n)
-            rows.append([*row, mean_sd(found.get((title, name, first, "")))])
-            known = [beside.get((title, name, first, c)) for c in levels["configuration"]]
+            rows.append([*row, mean_sd(found.get((title, name, *levels_of[name], "")))])
+            known = [beside.get((title, name, *levels_of[name], c)) for c in levels["configuration"]]
             if any(v is not None for v in known):
                 cells = [f"@published {number(v, 4)}" for v in known]
                 rows.append(["@published published", *cells, "@published "])
         html.table(["filter", *levels["configuration"], "all"], rows)
         for table in tables:
             html.text(f"Published: {table.origin} {table.note}".strip(), "note")
-    if (contents.published["by"] == "detector").any():
-        _published_detectors(html, contents)
+    for name in base:
+        if (contents.published["by"] == name).any():
+            _published_levels(html, contents, name)
 
 
-def _published_detectors(html: Html, contents: ReportContents) -> None:
-    part = contents.published.filter(pl.col("by") == "detector")
-    html.heading("Detectors, beside the published means")
+def _published_levels(html: Html, contents: ReportContents, factor: str) -> None:
+    part = contents.published.filter(pl.col("by") == factor)
+    html.heading(f"Levels of {factor}, beside the published means")
+    of = factors(contents.config)
     rows = []
     for r in part.iter_rows(named=True):
         measured = {"n": r["n"], "mean": r["measured"], "sd": r["measured_sd"]}
@@ -183,23 +203,22 @@ def _published_detectors(html: Html, contents: ReportContents) -> None:
         }
         rows.append(
             [
-                escape(r["filter"]),
-                escape(r["detector"]),
-                escape(r["configuration"]),
+                *(escape(r[f]) for f in of),
                 escape(f"{r['metric']} ({r['unit']})"),
                 mean_sd(measured),
                 str(r["n"]),
                 f"@published {mean_sd(published)}",
             ]
         )
-    html.table(["filter", "detector", "configuration", "metric", "measured", "n", "published"], rows, 4)
+    html.table([*of, "metric", "measured", "n", "published"], rows, len(of) + 1)
     for note in dict.fromkeys(part["note"].to_list()):
         if note:
             html.text(note, "note")
 
 
 def _methods(html: Html, contents: ReportContents, levels: dict[str, list[str]]) -> None:
-    html.section("Every filter and detector, clipped inputs apart")
+    by = ("filter", *cfg.factor_names(contents.config))
+    html.section(f"Every {' and '.join(by)}, clipped inputs apart")
     html.text(
         "Mean ± standard deviation over all configurations. An input is clipped where a sensor reached its "
         "full scale: "
@@ -210,18 +229,17 @@ def _methods(html: Html, contents: ReportContents, levels: dict[str, list[str]])
     subsets = [s for s in ("unclipped", "clipped") if (contents.groups["subset"] == s).any()] or ["all"]
     rows: list[list[str]] = []
     for subset in subsets:
-        found = _lookup(contents.groups, subset)
+        found = _lookup(contents, subset)
         body: list[list[str]] = []
-        for name in levels["filter"]:
-            for detector in levels["detector"]:
-                entries = [found.get((t, name, detector, "")) for t in titles]
-                if any(entries):
-                    n = max(e["n"] for e in entries if e)
-                    body.append([escape(name), escape(detector), *map(mean_sd, entries), str(n)])
+        for method in _combinations(contents, levels):
+            entries = [found.get((t, *method, "")) for t in titles]
+            if any(entries):
+                n = max(e["n"] for e in entries if e)
+                body.append([*map(escape, method), *map(mean_sd, entries), str(n)])
         if body:
             rows += [[f"{subset} inputs"], *body]
     head = [f"{t} ({units[t]})" if units[t] else t for t in titles]
-    html.table(["filter", "detector", *head, "n"], rows, 2)
+    html.table([*by, *head, "n"], rows, len(by))
 
 
 def _gallery(html: Html, pictures: Sequence[PagePicture], title: str, section: str) -> None:
@@ -252,7 +270,7 @@ def _consistency(html: Html, contents: ReportContents, pictures: Sequence[PagePi
             "filter can be consistent, and every error counts against it.",
             "note",
         )
-    levels = order(table, contents.config)
+    levels, of = order(table, contents.config), factors(contents.config)
     for (metric,), errors in table.group_by("metric", maintain_order=True):
         html.heading(f"{NEES_TITLES.get(str(metric), str(metric))}: mean NEES")
         rows: list[list[str]] = []
@@ -262,24 +280,25 @@ def _consistency(html: Html, contents: ReportContents, pictures: Sequence[PagePi
                 continue
             shown = [c for c in levels["configuration"] if c and c in part["configuration"]]
             shown.append("")
-            found = {(r["filter"], r["detector"], r["configuration"]): r for r in part.iter_rows(named=True)}
+            found = {tuple(r[f] for f in of): r for r in part.iter_rows(named=True)}
             rows.append([title])
-            rows.append(["filter", "detector", *(escape(c) or "all" for c in shown)])
-            for name in levels["filter"]:
-                for detector in levels["detector"]:
-                    entries = [found.get((name, detector, c)) for c in shown]
-                    if any(entries):
-                        rows.append([escape(name), escape(detector), *map(_verdict, entries)])
+            rows.append([*of[:-1], *(escape(c) or "all" for c in shown)])
+            for method in _combinations(contents, levels):
+                entries = [found.get((*method, c)) for c in shown]
+                if any(entries):
+                    rows.append([*map(escape, method), *map(_verdict, entries)])
             limits = [next(r for r in found.values() if r["configuration"] == c) for c in shown]
             rows.append(
                 [
                     "@note consistent within",
-                    "",
+                    *[""] * (len(of) - 2),
                     *(f"@note {number(r['low'])} … {number(r['high'])} ({r['n']})" for r in limits),
                 ]
             )
         width = max(len(r) for r in rows)
-        html.table([""] * width, [r if len(r) == 1 else [*r, *[""] * (width - len(r))] for r in rows], 2)
+        html.table(
+            [""] * width, [r if len(r) == 1 else [*r, *[""] * (width - len(r))] for r in rows], len(of) - 1
+        )
     html.pictures(p for p in pictures if p.section == "consistency")
 
 
@@ -310,20 +329,19 @@ def _normality(html: Html, contents: ReportContents, pictures: Sequence[PagePict
             f"{len(tested) - len(done)} of {len(tested)} groups are not tested: {_reasons(tested)}.", "note"
         )
     if len(done):
+        of = factors(contents.config)
         rows = [
             [
                 escape(r["metric"]),
-                escape(r["filter"]),
-                escape(r["detector"]),
-                escape(r["configuration"]),
+                *(escape(r[f]) for f in of),
                 str(r["n"]),
                 number(r["shapiro_w"], 4),
                 ("@differs " if r["shapiro_p"] < level else "") + probability(r["shapiro_p"]),
             ]
             for r in done.iter_rows(named=True)
         ]
-        head = ["metric", "filter", "detector", "configuration", "n", "W", "p"]
-        _folded(html, f"{len(rows)} groups", head, rows, 4)
+        head = ["metric", *of, "n", "W", "p"]
+        _folded(html, f"{len(rows)} groups", head, rows, len(of) + 1)
     html.pictures(p for p in pictures if p.section == "qq")
 
 
@@ -402,6 +420,7 @@ def _comparisons(html: Html, contents: ReportContents) -> None:
 
 def _labels(html: Html, contents: ReportContents, levels: dict[str, list[str]]) -> None:
     by, level = contents.config.by, 1 - contents.config.statistics.confidence
+    of = factors(contents.config)
     html.section(f"By {by}")
     html.text(
         f"Metrics taken over all intervals of a label of the tier {by} together, and over what lies between "
@@ -409,23 +428,23 @@ def _labels(html: Html, contents: ReportContents, levels: dict[str, list[str]]) 
         "within a walk: paired t test and Wilcoxon's signed-rank test, two-sided, corrected by Holm within the "
         f"method. Red: below {level:.2f} after the correction."
     )
-    means = label_means(contents.labels)
+    means = label_means(contents.labels, contents.config)
     labels = sorted(means["label"].unique(), key=lambda label: (label == BETWEEN, label))
-    found = {(r["metric"], *(r[f] for f in FACTORS), r["label"]): r for r in means.iter_rows(named=True)}
+    found = {(r["metric"], *(r[f] for f in of), r["label"]): r for r in means.iter_rows(named=True)}
     for (metric, unit), pairs in contents.label_comparisons.group_by("metric", "unit", maintain_order=True):
         html.heading(f"{metric} ({unit})" if unit else str(metric))
-        methods = list(product(levels["filter"], levels["detector"], levels["configuration"]))
+        methods = list(itertools.product(*(levels[f] for f in of)))
         rows = []
         for method in methods:
             cells = [found.get((metric, *method, label)) for label in labels]
             if any(cells):
                 values = [f"{mean_sd(c)} ({c['n']})" if c else "–" for c in cells]
                 rows.append([*(escape(m) for m in method), *values])
-        html.table([*FACTORS, *(escape(label) for label in labels)], rows, 3)
+        html.table([*of, *(escape(label) for label in labels)], rows, len(of))
         body = [
             [
                 escape(f"{r['a']} − {r['b']}"),
-                *(escape(r[f]) for f in FACTORS),
+                *(escape(r[f]) for f in of),
                 str(r["n"]),
                 f"{number(r['difference'])} ({number(r['difference_low'])} … {number(r['difference_high'])})",
                 number(r["effect"]),
@@ -434,8 +453,8 @@ def _labels(html: Html, contents: ReportContents, levels: dict[str, list[str]]) 
             ]
             for r in pairs.iter_rows(named=True)
         ]
-        head = ["pair", *FACTORS, "n", "difference", "d", "t p (Holm)", "Wilcoxon p (Holm)"]
-        _folded(html, f"{len(body)} pairs", head, body, 4)
+        head = ["pair", *of, "n", "difference", "d", "t p (Holm)", "Wilcoxon p (Holm)"]
+        _folded(html, f"{len(body)} pairs", head, body, len(of) + 1)
 
 
 def _outliers(html: Html, contents: ReportContents) -> None:
@@ -447,17 +466,16 @@ def _outliers(html: Html, contents: ReportContents) -> None:
     count = len(contents.outliers)
     html.text(
         f"{count} of {len(contents.values)} values lie more than {sigma:g} standard deviations from the mean "
-        "of their filter × "
-        "detector × configuration and are left out of means, plots and tests. "
+        f"of their {' × '.join(factors(contents.config))} and are left out of means, plots and tests. "
         f"Among n values none can lie beyond (n − 1)/√n, so the rule needs {_least(sigma)} values to strike."
     )
     if count:
-        head = ["metric", "filter", "detector", "configuration", "recording", "input", "value"]
+        head = ["metric", *factors(contents.config), "recording", "input", "value"]
         rows = [
             [*(escape(str(r[c])) for c in head[:-1]), f"{number(r['value'])} {escape(r['unit'])}"]
             for r in contents.outliers.iter_rows(named=True)
         ]
-        _folded(html, f"{count} values", head, rows, 6)
+        _folded(html, f"{count} values", head, rows, len(head) - 1)
 
 
 def _least(sigma: float) -> int:

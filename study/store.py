@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -57,8 +57,8 @@ class CellStore:
         write_atomic(self.folder / f"{name}.msgpack", lambda path: path.write_bytes(data))
 
 
-def tidy(cells: Iterable[StudyCell]) -> pl.DataFrame:
-    """Return one row a cell: what ran on what, how it ended, and a column a metric."""
+def tidy(cells: Iterable[StudyCell], factors: Sequence[str] = ()) -> pl.DataFrame:
+    """Return one row a cell: what ran on what, how it ended, a column a factor and a metric."""
     cells = list(cells)
     names = sorted({name for cell in cells for name in cell.metrics})
     fixed = pl.DataFrame(
@@ -67,7 +67,7 @@ def tidy(cells: Iterable[StudyCell]) -> pl.DataFrame:
             "configuration": [c.configuration for c in cells],
             "input": [c.input for c in cells],
             "filter": [c.label for c in cells],
-            "detector": [c.detector for c in cells],
+            **{name: [c.levels.get(name, "") for c in cells] for name in factors},
             "estimator": [c.estimator for c in cells],
             "preset": [c.preset for c in cells],
             "params": [c.params for c in cells],
@@ -81,7 +81,7 @@ def tidy(cells: Iterable[StudyCell]) -> pl.DataFrame:
             "key": [c.key for c in cells],
         },
         schema={
-            **dict.fromkeys(("recording", "configuration", "input", "filter", "detector"), pl.String),
+            **dict.fromkeys(("recording", "configuration", "input", "filter", *factors), pl.String),
             **dict.fromkeys(("estimator", "preset", "params", "status", "error"), pl.String),
             "clipped": pl.Boolean,
             "clipped_readings": pl.Int64,

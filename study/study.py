@@ -216,7 +216,7 @@ def run_study(
             _with_configuration(cell, source, config) for source, job in wanted for cell in finished[job.key]
         ]
         _forget_old_recordings(folder / "recordings", sources)
-        results = tidy(cells)
+        results = tidy(cells, cfg.factor_names(config))
         values = analysis.values(results, config)
         consistency = analysis.consistency(results, config)
         tables: list[pl.DataFrame] = []
@@ -238,7 +238,7 @@ def run_study(
         values=values,
         groups=groups,
         comparisons=comparisons,
-        outliers=analysis.outliers(values),
+        outliers=analysis.outliers(values, config),
         published=analysis.beside_published(groups, config),
         consistency=consistency,
         labels=by_label,

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from marcha.recording import UsageError
 from marcha.study import load, presets
-from marcha.study.config import StudyConfig, configuration, methods, truth
+from marcha.study.config import StudyConfig, configuration, factor_names, methods, truth
 from marcha.study.plan import StudyRecording, find_sources, jobs, tasks
 
 MINIMAL = """
@@ -29,10 +29,10 @@ def parse(text: str, folder: Path) -> StudyConfig:
 def test_lists_of_parameters_span_a_grid(tmp_path: Path) -> None:
     text = (
         MINIMAL
-        + 'label = "N"\nparams = { sigma_acc = [0.1, 0.2], gravity = 9.8 }\ndetectors = ["shoe", "are"]'
+        + 'label = "N"\nparams = { sigma_acc = [0.1, 0.2], gravity = 9.8 }\nfactors.detector = ["shoe", "are"]'
     )
     grid = methods(parse(text, tmp_path))
-    assert [(m.label, m.detector) for m in grid] == [
+    assert [(m.label, m.levels["detector"]) for m in grid] == [
         ("N sigma_acc=0.1", "shoe"),
         ("N sigma_acc=0.1", "are"),
         ("N sigma_acc=0.2", "shoe"),
@@ -56,13 +56,30 @@ def test_a_configuration_is_read_without_importing_its_estimators() -> None:
     assert done.stdout.strip() == "[]"
 
 
-def test_a_detector_may_be_a_preset_that_sets_one(tmp_path: Path) -> None:
-    text = MINIMAL.replace("foot.naive", "foot.9iez") + 'detectors = ["shoe", "shoe-tuned"]\n'
+def test_a_level_may_be_a_preset_that_sets_the_parameter(tmp_path: Path) -> None:
+    text = MINIMAL.replace("foot.naive", "foot.9iez") + 'factors = { detector = ["shoe", "shoe-tuned"] }\n'
     plain, tuned = methods(parse(text + 'presets = ["device"]', tmp_path))
-    assert (plain.detector, tuned.detector) == ("shoe", "shoe-tuned")
+    assert (plain.levels["detector"], tuned.levels["detector"]) == ("shoe", "shoe-tuned")
     assert (plain.preset, tuned.preset) == ("device", "device")
     assert plain.params == {"detector": "shoe"}
     assert tuned.params == {"detector": "shoe", "shoe_max": 1e5}
+
+
+def test_any_parameters_are_factors_and_levels_keep_their_type(tmp_path: Path) -> None:
+    text = "[factors]\nsigma_acc = [0.1, 0.2]\nhupt = [false, true]\n" + MINIMAL.replace(
+        "foot.naive", "foot.9iez"
+    )
+    text += '[[estimators]]\nname = "foot.naive"\nfactors = { hupt = [], sigma_acc = [0.3] }\n'
+    config = parse(text, tmp_path)
+    grid = methods(config)
+    assert factor_names(config) == ("sigma_acc", "hupt")
+    assert [tuple(m.levels.values()) for m in grid[:2]] == [("0.1", "False"), ("0.1", "True")]
+    assert grid[1].params == {"sigma_acc": 0.1, "hupt": True}
+    assert (len(grid), grid[4].levels, grid[4].params) == (
+        5,
+        {"sigma_acc": "0.3", "hupt": ""},
+        {"sigma_acc": 0.3},
+    )
 
 
 def test_scenarios_are_told_apart_and_rules_are_searched_in_a_walks_configuration() -> None:
@@ -77,7 +94,12 @@ def test_scenarios_are_told_apart_and_rules_are_searched_in_a_walks_configuratio
     [
         ("colour = 1", "unknown field `colour`"),
         ("params = { a = [] }", "parameter a has an empty list"),
-        ('params = { detector = "shoe" }\ndetectors = ["are"]', "give `detector` either"),
+        ('params = { detector = "shoe" }\nfactors = { detector = ["are"] }', "give `detector` either"),
+        ('factors = { filter = ["a"] }', "is the name of a column"),
+        (
+            '[[metrics]]\ncolumn = "EP"\n[[published]]\nmetric = "EP"\norigin = ""\nrows = {}\nby = "detector"',
+            "nor a factor of this study",
+        ),
         ('[[estimators]]\nname = "foot.naive"', "occurs twice"),
         ('[[configurations]]\npattern = "("\nlabel = "x"', "is no regular expression"),
         ("[[configurations]]\npattern = 'a(b)'\nlabel = '\\2'", "does not fit pattern"),
@@ -108,7 +130,7 @@ def test_an_unknown_preset_lists_what_there_is() -> None:
 @pytest.mark.parametrize("name", presets())
 def test_presets_load_and_their_methods_have_names_of_their_own(name: str) -> None:
     config, base = load(name)
-    names = [(m.label, m.detector) for m in methods(config)]
+    names = [(m.label, *m.levels.values()) for m in methods(config)]
     assert base is None
     assert len(names) == len(set(names))
 
