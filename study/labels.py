@@ -65,7 +65,8 @@ def label_comparisons(values: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataF
     """Compare every pair of labels within each method and configuration, paired by walk and input.
 
     A family, corrected by Holm, is a metric of one method in one configuration. Columns: metric,
-    unit, filter, factors and configuration, ``a, b`` and the fields of :class:`~marcha.study.statistics.PairedComparison`.
+    unit, filter, factors, configuration, ``a, b`` and the fields of
+    :class:`~marcha.study.statistics.PairedComparison`.
     """
     options, keys = config.statistics, _keys(config)
     rows: list[dict[str, Any]] = []
