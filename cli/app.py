@@ -64,6 +64,12 @@ COMMANDS: tuple[tuple[Group, str, str, str], ...] = (
     (HAND, "view", "view:view", "Show recordings on one time line in the Rerun viewer."),
     (
         HAND,
+        "report",
+        "report:report",
+        "Write one page about recordings: figures, errors, annotations, origin.",
+    ),
+    (
+        HAND,
         "annotate",
         "annotate:app",
         "Add, change, import, export, list or compare annotations of a recording.",

@@ -7,6 +7,8 @@ enough: Debian's mesa-vulkan-drivers and libvulkan1). Pictures of views that com
 from __future__ import annotations
 
 import io
+import shutil
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -15,7 +17,10 @@ import marcha.ingest as ingest
 import marcha.recording as mr
 import marcha.replay as rp
 import marcha.viz as viz
+import polars as pl
 from marcha.ingest.simulate import simulate
+from marcha.recording.changes import change
+from marcha.viz.recording_page import recordings_page
 from marcha.viz.screenshot import Screenshot, screenshots
 
 IMAGES = Path(__file__).parent / "images"
@@ -58,6 +63,31 @@ def domains(folder: Path, images: Path) -> None:
             save(picture, images / f"viewer-{name}.png")
 
 
+def page(folder: Path, image: Path) -> None:
+    """Take the picture of a report's part by label, where a Chromium is installed."""
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        print(f"{image}: left as it is, there is no chromium")
+        return
+    from PIL import Image
+
+    raw = simulate("walking", folder / "leg", seed=3)
+    ingest.convert(raw.paths, folder / "leg.raw.mcap")
+    rec = mr.open(folder / "leg.raw.mcap")
+    at = [rec.start_ns + round(rec.duration_s * 1e9 * share) for share in (0.1, 0.33, 0.5, 0.75)]
+    marks = {"tier": ["terrain"] * 2, "label": ["grass", "gravel"], "start_ns": at[::2], "end_ns": at[1::2]}
+    rp.replay(rec, ["joint.hinge"], out=folder / "leg.done.mcap")
+    change(mr.open(folder / "leg.done.mcap"), folder / "leg.mcap", add=pl.DataFrame(marks))
+    html = recordings_page([mr.open(folder / "leg.mcap")], picture=False)
+    hidden = "<style>main > :not(#s3, #s3 ~ *) { display: none }</style>"  # only what is by label
+    (folder / "leg.html").write_text(html.replace("<body>", f"<body>{hidden}"), encoding="utf-8")
+    shot = folder / "page.png"
+    options = ["--headless", "--no-sandbox", "--hide-scrollbars", "--window-size=1300,1400"]
+    subprocess.run([chromium, *options, f"--screenshot={shot}", str(folder / "leg.html")], check=True)
+    Image.open(shot).convert("RGB").quantize(240, dither=Image.Dither.NONE).save(image, optimize=True)
+    print(image)
+
+
 def main() -> None:
     """Make all pictures."""
     images = Path(sys.argv[1]) if len(sys.argv) > 1 else IMAGES
@@ -65,6 +95,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         domains(folder, images)
+        page(folder, images / "report.png")
         walk = replayed(folder, "rectangle", FILTERS, "rectangle")
         rrd = viz.write_rrd(walk, folder / "rectangle.rrd")
         for picture in screenshots(rrd, ["Overview", "Raw", "Compare", "Report"], at=0.62):

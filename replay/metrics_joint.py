@@ -24,6 +24,7 @@ SETTLING_S = 1.2
 """Start of a run that is left out, as in the source."""
 GAP_NS = 100_000_000
 POINTS = 101
+JOINT_STATE = "sensor_msgs/msg/JointState"
 
 
 def wrapped_deg(estimate: FloatArray, reference: FloatArray) -> FloatArray:
@@ -217,14 +218,15 @@ def joints(view: RunView) -> dict[str, float]:
     if ours is None or truth is None:
         return {}
     found: dict[str, float] = {}
-    for name in _joints(ours):
+    for name in joint_columns(ours):
         if name in truth.columns:
             values = figures(*_column(ours, name), *_column(truth, name), spans=view.spans)
             found.update({f"{key}.{name}": value for key, value in values.items()})
     return found
 
 
-def _joints(table: pl.DataFrame) -> list[str]:
+def joint_columns(table: pl.DataFrame) -> list[str]:
+    """Return the columns that are angles of joints."""
     return [c for c in table.columns if c not in ("t_ns", "t_log_ns") and not c.endswith((".vel", ".effort"))]
 
 

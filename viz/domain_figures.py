@@ -20,6 +20,7 @@ from .canvas import PLACES, is_estimate
 from .curve import Curve
 from .floor import Anchor, floor_plan, loaders_of
 from .shapes import ELLIPSE95, circle, geo_circle, metres_a_degree
+from .stride_figures import strides
 from .text import printable
 from .trace import Trace, compared, distance, reference_of
 from .views.base import role_of
@@ -290,14 +291,21 @@ def joints(rec: Recording, fig: Figure) -> None:
         for name in rec.channels[topic].columns:
             if not name.endswith((".vel", ".effort")):
                 angles.setdefault(name, []).append(topic)
-    axes = _rows(fig, 2 * len(angles))
-    for (joint, topics), ax, below in zip(angles.items(), axes[::2], axes[1::2], strict=True):
+    estimated = {j for j, topics in angles.items() if any(is_estimate(t) for t in topics)}
+    axes = iter(_rows(fig, len(angles) + len(estimated)))
+    for joint, topics in angles.items():
+        ax = next(axes)
         curves: dict[str, Curve] = {}
         for topic in sorted(topics, key=lambda t: ("reference", "raw", "estimate").index(role_of(t))):
             table, curves[topic] = rec.table(topic), Curve()
             values = np.degrees(table[joint].to_numpy())
             curves[topic].add(table["t_ns"].to_numpy(), values)
             ax.plot(_s(rec, table), values, color=_color(rec, topic), linewidth=1.1, label=_owner(topic))
+        printed = printable(joint)
+        _dress(ax, f"{printed} angle", TIME, "°")
+        if joint not in estimated:
+            continue
+        below = next(axes)
         truth = next((t for t in curves if not is_estimate(t)), None)
         for topic in [t for t in curves if is_estimate(t) and truth]:
             t_ns, wrong = difference(curves[topic], curves[truth or ""])
@@ -309,8 +317,6 @@ def joints(rec: Recording, fig: Figure) -> None:
                 table = rec.table(stated)
                 sd = np.degrees(table[joint].to_numpy())
                 below.fill_between(_s(rec, table), -sd, sd, color=color, alpha=0.2, linewidth=0)
-        printed = printable(joint)
-        _dress(ax, f"{printed} angle", TIME, "°")
         _dress(below, f"{printed} error to {_owner(truth or 'no reference')} (area: ±1σ)", TIME, "°")
 
 
@@ -345,5 +351,6 @@ FIGURES: dict[str, Callable[[Recording, Any], None]] = {
     "error": error,
     "joints": joints,
     "jumps": jumps,
+    "strides": strides,
 }
 """Figures by name, beside ``walk``."""
