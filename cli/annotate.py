@@ -37,6 +37,59 @@ app = App(
 Tier = Annotated[str | None, Parameter(name="--tier")]
 
 
+@app.default
+def by_eye(
+    path: Path,
+    /,
+    *,
+    page: Annotated[bool, Parameter(name="--page", negative="")] = False,
+    browser: Annotated[bool, Parameter(name="--browser", negative="--no-browser")] = True,
+    video: Path | None = None,
+    video_offset: Annotated[float, Parameter(name="--video-offset", allow_leading_hyphen=True)] = 0.0,
+    where: Where = WHERE,
+    common: Common = DEFAULT,
+) -> Outcome:
+    """Annotate by eye, in a page of this machine's browser.
+
+    Parameters
+    ----------
+    path : Path
+        The recording.
+    page : bool
+        Open the page: signals, annotations, the film of the walk; by mouse or by keyboard alone.
+    browser : bool
+        Open a browser window; without it the address is only printed.
+    video : Path
+        Film of the walk; NAME.mp4 or NAME.webm beside the recording is found without it.
+    video_offset : float
+        Seconds of the recording at which the film begins.
+    """
+    from .. import recording
+    from ..recording.errors import UsageError
+    from ..viz.annotating import annotate_page
+    from ..viz.annotating.session import Session
+
+    if not page:
+        raise UsageError(f"annotate {path}: give --page to mark by eye, or a command: marcha annotate --help")
+    rec = recording.open(path)
+    say_losses(rec)
+    session = Session(rec, where.target(rec), action="page", **where.how)
+    if session.taken_up:
+        complain(f"took up {session.taken_up} edits of an earlier session from {session.draft}")
+    annotate_page(
+        session,
+        video=video,
+        video_offset_s=video_offset,
+        open_browser=browser,
+        opened=lambda server: complain(f"the page is at {server.address}; Ctrl-C ends it"),
+    )
+    left = session.unsaved
+    if left:
+        complain(f"{left} annotations are not saved; {session.draft} keeps them for the next session")
+    document = {"output": str(session.out), "annotations": len(session.rows), "unsaved": left}
+    return Outcome(document, [Heading(f"{session.out}: {len(session.rows)} annotations, {left} not saved")])
+
+
 @app.command
 def add(
     path: Path,

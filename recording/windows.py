@@ -101,7 +101,8 @@ def cut(held: dict[str, list[Columns]], horizon: int | None, max_rows: int) -> I
     logs = {topic: table["t_log_ns"].to_numpy() for topic, table in tables.items()}
     if not logs:
         return
-    times = np.sort(np.concatenate(list(logs.values())))
+    # stable: each channel is in order already, and merging runs takes a fifth of the time of sorting
+    times = np.sort(np.concatenate(list(logs.values())), kind="stable")
     if horizon is not None:
         times = times[: np.searchsorted(times, horizon)]
     if not len(times):

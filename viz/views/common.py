@@ -8,7 +8,6 @@ import numpy as np
 import polars as pl
 
 from ...recording import SCHEMAS
-from ...recording.schemas import Column
 from .. import style
 from ..canvas import (
     DETECTOR,
@@ -22,6 +21,7 @@ from ..canvas import (
     columns_of,
     thresholds_of,
 )
+from ..naming import shown_as, unit_in, unit_of
 from ..text import printable
 from .base import View
 from .lanes import Lane
@@ -39,8 +39,6 @@ USE = "use"
 
 LONGEST = 300
 """Characters of a text in the log; the recording has all of it."""
-
-RAD = ("rad", "rad/s")
 
 
 class General(View):
@@ -98,15 +96,7 @@ class General(View):
         return f"{head} ({unit})" if unit else head
 
     def _unit(self, column: str, kind: str) -> str:
-        if kind == "time":
-            return "s after the message"
-        schema = SCHEMAS.get(self.channel.schema)
-        found: list[Column] = [] if schema is None else list(schema.columns)
-        if schema is not None and schema.names:  # a named schema's columns are suffixes behind the name
-            matching = [c for c in found if c.name and column.endswith(c.name)]
-            found = matching or [c for c in found if not c.name]
-            return found[0].unit if found else ""
-        return next((c.unit for c in found if c.name == column), "")
+        return "s after the message" if kind == "time" else unit_of(self.channel.schema, column)
 
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
         if self.kinds is None:
@@ -333,27 +323,6 @@ def euler_deg(quat_wxyz: Floats) -> Floats:
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return np.degrees(np.column_stack([roll, pitch, yaw]))
-
-
-def shown_as(column: str, unit: str = "") -> style.ColumnStyle:
-    """Return how a column is shown: by its own entry in the style, in degrees where it is an angle, or with
-    its unit.
-    """
-    if column in style.COLUMNS:
-        return style.COLUMNS[column]
-    if unit in RAD or (unit in ("", "-", "as named") and column.endswith("_rad")):
-        name = column.removesuffix("_rad")
-        return style.ColumnStyle(f"{name} ({'°' if unit != 'rad/s' else '°/s'})", style.DEGREES)
-    unit = "" if unit in ("-", "as named") else unit
-    for suffix, of_suffix in style.SUFFIXES.items():
-        if not unit and column.endswith(suffix):
-            return style.ColumnStyle(f"{column.removesuffix(suffix)} ({of_suffix})")
-    return style.ColumnStyle(f"{column} ({unit})" if unit else column)
-
-
-def unit_in(name: str) -> str:
-    """Return the unit at the end of a shown name."""
-    return name.rsplit("(", 1)[-1][:-1] if name.endswith(")") and "(" in name else ""
 
 
 def slug(name: str) -> str:

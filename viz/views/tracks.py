@@ -10,10 +10,10 @@ import rerun as rr
 
 from .. import style
 from ..canvas import COMPARE, ESTIMATES, OVERVIEW, PLACES, SPACE, ChannelLike, Floats, Times, columns_of
+from ..naming import shown_as
 from ..shapes import ELLIPSE95, circle, thinned
 from ..trace import Trace
 from .base import View
-from .common import shown_as
 
 CLOSED_M = 1.0
 """Start and end closer than this have one label."""
