@@ -139,6 +139,28 @@ def instant(text: str | None, rec: Recording, option: str) -> int | None:
     return span if match["at"] else (rec.start_ns or 0) + span
 
 
+def spans(pairs: tuple[str, ...], rec: Recording, option: str) -> dict[str, list[tuple[int, int]]]:
+    """Return stretches of time by topic from TOPIC=START:LENGTH, log time in nanoseconds, half open.
+
+    Raises
+    ------
+    UsageError
+        A text that is not of this form.
+    """
+    from ..recording.errors import UsageError
+
+    found: dict[str, list[tuple[int, int]]] = {}
+    for pair in pairs:
+        topic, given, text = pair.partition("=")
+        begin, colon, length = text.rpartition(":")
+        if not (given and colon and begin and length):
+            raise UsageError(f"{option} {pair}: write TOPIC=START:LENGTH, such as /phone/gnss=120:60s")
+        start = instant(begin, rec, option)
+        assert start is not None
+        found.setdefault(topic, []).append((start, start + span_ns(length, option)))
+    return found
+
+
 def span_ns(text: str, option: str) -> int:
     """Return a length of time in nanoseconds: ``0.25``, ``250ms`` …; :func:`instant` states the errors."""
     from decimal import Decimal

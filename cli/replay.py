@@ -27,6 +27,7 @@ from .options import (
     instant,
     limits,
     settings,
+    spans,
 )
 
 
@@ -42,6 +43,8 @@ def replay(
     end: Annotated[str | None, Parameter(name="--to")] = None,
     gap: Annotated[Literal["bridge", "reset", "stop"], Shown] = "bridge",
     calibration: Annotated[Paths, Parameter(name="--calibration")] = (),
+    withhold: Annotated[Strings, Parameter(name="--withhold")] = (),
+    survey: Path | None = None,
     output: MaybeRecordingOutput = None,
     rrd: Path | None = None,
     show: bool = False,
@@ -75,6 +78,11 @@ def replay(
         What a pause of the input does: bridge it, reset the estimator after it, or stop before it.
     calibration : Path
         File of `marcha calibrate`, handed to the estimators; may be repeated.
+    withhold : str
+        TOPIC=START:LENGTH, an artificial loss of a signal: messages that no estimator is given, such as
+        /phone/gnss=120:60s; may be repeated. The metrics say how far off the track is at its end.
+    survey : Path
+        Recording of fixes along the same route at another time; tracks are measured by their distance to it.
     output : Path
         Recording to write: everything that was in the input, and the estimates.
     rrd : Path
@@ -107,6 +115,8 @@ def replay(
             sinks=sinks,
             gap=gap,
             calibrations=[rp.load_calibration(c) for c in calibration],
+            withhold=spans(withhold, rec, "--withhold"),
+            survey=recording.open(survey) if survey else None,
             keep_tables=output is None,  # with a file, memory stays bounded and metrics come from there
             progress=report,
         )
@@ -171,8 +181,9 @@ def evaluate(
     maximum: Annotated[Strings, Parameter(name="--max")] = (),
     minimum: Annotated[Strings, Parameter(name="--min")] = (),
     run: Annotated[Strings, Parameter(name="--run")] = (),
-    alignment: Annotated[Literal["none", "origin", "origin-yaw", "se2", "se3"], Shown] = "se3",
+    alignment: Annotated[Literal["none", "origin", "origin-yaw", "se2", "sim2", "se3"], Shown] = "se3",
     reference: str | None = None,
+    survey: Path | None = None,
     truth: Strings = (),
     by: str | None = None,
     common: Common = DEFAULT,
@@ -191,9 +202,11 @@ def evaluate(
         Id of a run to measure; may be repeated. All without it.
     alignment : str
         How a track is laid on the reference: as it is, first position, also first heading, least squares
-        over turn about the vertical and shift, or over all rotations and shift.
+        over turn about the vertical and shift, also over a scale, or over all rotations and shift.
     reference : str
         Topic of a reference, where several would fit.
+    survey : Path
+        Recording of fixes along the same route at another time; tracks are measured by their distance to it.
     truth : str
         What is known of the walk beside what the recording says: closed=true, length_m=22.1, steps=63; may be
         repeated.
@@ -214,6 +227,7 @@ def evaluate(
         reference=reference,
         truth={k: str(v).lower() for k, v in settings(truth, "--truth").items()},
         by=by,
+        survey=recording.open(survey) if survey else None,
     )
     say_losses(rec)
     missed = rp.check_thresholds(evaluation, *bounds)

@@ -5,6 +5,7 @@ the foot is still; it becomes ``/reference/pose``, ``/reference/velocity`` and `
 ``<stem>.truth.imu2.csv`` has the same of sensor 2, for ``/reference/imu2/pose`` and so on.
 ``<stem>.truth.leg.csv`` has ``t_ns``, columns ``joint.<name>`` (rad) and ``<segment>.quat_w`` …, for
 ``/reference/joint`` and ``/reference/<segment>/orientation``.
+``<stem>.truth.fix.csv`` has ``t_ns``, latitude, longitude (deg) and height of the same walk, for ``/reference/fix``.
 ``<stem>.truth.steps.csv`` has the steps of a person with a phone, for ``/reference/steps``; stance is left out.
 ``<stem>.truth.toml`` holds facts (closed, length_m, scenario, seed …) for the metadata record ``truth``.
 """
@@ -12,7 +13,7 @@ the foot is still; it becomes ``/reference/pose``, ``/reference/velocity`` and `
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import msgspec
@@ -23,6 +24,7 @@ from ..recording.files import read_toml
 from .contract import ChannelSpec
 
 POSE = ("pos_x", "pos_y", "pos_z", "quat_w", "quat_x", "quat_y", "quat_z")
+FIX = ("lat_deg", "lon_deg", "alt_m")
 STEP = "marcha_msgs/msg/Step"
 VELOCITY = ("vel_x", "vel_y", "vel_z")
 
@@ -72,6 +74,10 @@ def read_truth(path: Path) -> TruthFile | None:
         files.append(steps)
         walked = _steps(steps)  # without a row where nobody walks: the columns are said beforehand
         tables.append((ChannelSpec("/reference/steps", STEP, "nav", tuple(walked.columns[1:])), walked))
+    if (places := path.with_name(f"{path.stem}.truth.fix.csv")).is_file():
+        files.append(places)
+        spec = ChannelSpec("/reference/fix", "sensor_msgs/msg/NavSatFix", "wgs84", FIX)
+        tables.append((spec, _numbers(places, FIX)))
     for part, name in parts.items():
         if (file := path.with_name(name)).is_file():
             files.append(file)
@@ -147,7 +153,13 @@ def _steps(file: Path) -> pl.DataFrame:
 
 
 def _table(file: Path) -> pl.DataFrame:
-    columns = {"t_ns": pl.Int64, **dict.fromkeys((*POSE, *VELOCITY), pl.Float64), "still": pl.String}
+    table = _numbers(file, (*POSE, *VELOCITY), still=pl.String)
+    return table.with_columns(pl.col("still").is_in(["1", "true", "True", "1.0"]))
+
+
+def _numbers(file: Path, names: Sequence[str], **others: type[pl.DataType]) -> pl.DataFrame:
+    """Return a table of truth: ``t_ns``, numbers, and other columns."""
+    columns = {"t_ns": pl.Int64, **dict.fromkeys(names, pl.Float64), **others}
     try:
         table = pl.read_csv(file, schema_overrides=columns)
     except (OSError, pl.exceptions.PolarsError) as error:
@@ -155,9 +167,7 @@ def _table(file: Path) -> pl.DataFrame:
     missing = [c for c in columns if c not in table.columns]
     if missing:
         raise MarchaError(f"{file}: column {missing[0]} is missing; a truth table has {', '.join(columns)}")
-    table = table.select(
-        *(c for c in columns if c != "still"), still=pl.col("still").is_in(["1", "true", "True", "1.0"])
-    )
+    table = table.select(*columns)
     if table.null_count().sum_horizontal().item() or not table["t_ns"].is_sorted():
         raise MarchaError(f"{file}: a truth table has no empty cells and its time never decreases")
     return table

@@ -12,7 +12,7 @@ from ..algorithms.contract import FloatArray
 from ..recording.errors import UsageError
 
 IntArray = NDArray[np.int64]
-Alignment = Literal["none", "origin", "origin-yaw", "se2", "se3"]
+Alignment = Literal["none", "origin", "origin-yaw", "se2", "sim2", "se3"]
 ALIGNMENTS: tuple[str, ...] = get_args(Alignment)
 HEADING_M = 2.0
 """Horizontal way from the start that gives the heading where a track has no orientation."""
@@ -20,7 +20,7 @@ HEADING_M = 2.0
 
 @dataclass(frozen=True)
 class Transform:
-    """Takes the estimate's coordinates to the reference's: ``p_ref = rotation @ p_est + translation``.
+    """Takes the estimate's coordinates to the reference's: ``p_ref = scale · rotation @ p_est + translation``.
 
     Attributes
     ----------
@@ -28,18 +28,21 @@ class Transform:
         Proper rotation.
     translation : ndarray, shape (3,)
         Metres.
+    scale : float
+        1 but for ``sim2``.
     """
 
     rotation: FloatArray
     translation: FloatArray
+    scale: float = 1.0
 
     def points(self, p: FloatArray) -> FloatArray:
         """Transform positions, shape (n, 3)."""
-        return p @ self.rotation.T + self.translation
+        return self.scale * p @ self.rotation.T + self.translation
 
     def vectors(self, v: FloatArray) -> FloatArray:
         """Transform vectors (velocities), shape (n, 3)."""
-        return v @ self.rotation.T
+        return self.scale * v @ self.rotation.T
 
     @property
     def yaw(self) -> float:
@@ -77,11 +80,11 @@ def align(
     ----------
     estimate, reference : ndarray, shape (n, 3)
         Matched positions in metres, n ≥ 1.
-    kind : {"none", "origin", "origin-yaw", "se2", "se3"}
+    kind : {"none", "origin", "origin-yaw", "se2", "sim2", "se3"}
         ``none``: coordinates as they are. ``origin``: first positions laid upon each other. ``origin-yaw``:
         that, and the heading at the start, from the orientations given or else from the way of the first 2 m.
-        ``se2``: least squares over a turn about z and a translation. ``se3``: least squares over all
-        rotations and a translation, without scale (Horn 1987; Umeyama 1991).
+        ``se2``: least squares over a turn about z and a translation. ``sim2``: that, and a scale. ``se3``: least
+        squares over all rotations and a translation, without scale (Horn 1987; Umeyama 1991).
     estimate_yaw, reference_yaw : float, optional
         Headings at the start in radians, where both tracks have an orientation.
 
@@ -107,12 +110,16 @@ def align(
         return Transform(rotation, reference[0] - rotation @ estimate[0])
     centre_e, centre_r = estimate.mean(axis=0), reference.mean(axis=0)
     cross = (reference - centre_r).T @ (estimate - centre_e)
-    if kind == "se2":
+    if kind in ("se2", "sim2"):
         rotation = about_z(float(np.arctan2(cross[1, 0] - cross[0, 1], cross[0, 0] + cross[1, 1])))
     else:
         u, _, vt = np.linalg.svd(cross)
         rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))]) @ vt
-    return Transform(rotation, centre_r - rotation @ centre_e)
+    scale = 1.0
+    if kind == "sim2":
+        spread = float(np.sum((estimate - centre_e)[:, :2] ** 2))
+        scale = float(np.trace(rotation[:2, :2].T @ cross[:2, :2])) / spread if spread > 0 else 1.0
+    return Transform(rotation, centre_r - scale * rotation @ centre_e, scale)
 
 
 def _start_headings(estimate: FloatArray, reference: FloatArray) -> tuple[float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -41,6 +42,8 @@ def replay(
     clock: Clock | None = None,
     progress: Progress | None = None,
     calibrations: Sequence[Calibration] = (),
+    withhold: Mapping[str, Sequence[tuple[int, int]]] | None = None,
+    survey: Recording | None = None,
     max_rows: int = 65_536,
 ) -> ReplayResult:
     """Feed a recording (or a live source) to estimators, as if it happened now, and keep what they say.
@@ -82,6 +85,11 @@ def replay(
         Called with nanoseconds done and in all.
     calibrations : sequence of Calibration
         Handed to estimators, before those that the recording has.
+    withhold : mapping of str to sequence of (int, int), optional
+        Messages of a recording that no estimator is given, by topic: from when to when (log time in ns, half
+        open). An artificial loss of a signal; metrics measure the track at its end (``loss_error_m``).
+    survey : Recording, optional
+        For the metrics; see :func:`evaluate`.
     max_rows : int
         Rows of a block.
 
@@ -99,7 +107,9 @@ def replay(
         ``out`` is there and ``overwrite`` is false.
     """
     rec = recording if isinstance(recording, Recording) else None
-    source: Source = RecordingSource(rec, max_rows) if rec is not None else recording  # type: ignore[assignment]
+    source: Source = (
+        RecordingSource(rec, max_rows, withhold) if rec is not None else recording  # type: ignore[assignment]
+    )
     target = Path(out) if out is not None else None
     if target is not None:
         if rec is not None and target.exists() and os.path.samefile(target, rec.path):
@@ -122,11 +132,15 @@ def replay(
             run.lineage["input_recording"] = source.name
             if digest:
                 run.lineage["input_blake2b"] = digest
+            if withhold:
+                run.lineage["withheld"] = json.dumps(
+                    {t: [list(p) for p in spans] for t, spans in withhold.items()}
+                )
             if tables is not None:
                 kept = {name: tables.table(topic) for name, topic in run.outputs.items()}
                 run.tables = {name: t for name, t in kept.items() if t is not None}
                 if metrics:
-                    view = recording_view(rec, run.lineage, run.tables, start_ns, end_ns)
+                    view = recording_view(rec, run.lineage, run.tables, start_ns, end_ns, survey=survey)
                     measured = evaluate_run(view)
                     run.metrics, run.alignment = measured.metrics, measured.alignment
 
@@ -157,7 +171,7 @@ def replay(
         raise failure
     if target is not None and tables is None and metrics:
         with open_recording(target) as written:
-            found = evaluate(written, runs=[r.run for r in result.runs], intervals=False)
+            found = evaluate(written, runs=[r.run for r in result.runs], intervals=False, survey=survey)
         evaluated = {r.run: r for r in found.runs}
         for run in result.runs:
             run.metrics, run.alignment = evaluated[run.run].metrics, evaluated[run.run].alignment

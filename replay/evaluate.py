@@ -15,7 +15,7 @@ from ..recording import Recording
 from ..recording.errors import MarchaError, UsageError
 from .alignment import IntArray
 from .metrics import available_metrics
-from .references import reference_of
+from .references import KINDS, reference_of, references
 from .view import RunView, Truth, joined
 
 
@@ -140,6 +140,7 @@ def evaluate(
     truth: Mapping[str, str] | None = None,
     by: str | None = None,
     annotations: pl.DataFrame | None = None,
+    survey: Recording | None = None,
 ) -> Evaluation:
     """Measure every run of a replayed recording.
 
@@ -149,7 +150,7 @@ def evaluate(
         With estimates, as :func:`replay` writes it.
     runs : list of str, optional
         Ids; all without it.
-    alignment : {"none", "origin", "origin-yaw", "se2", "se3"}
+    alignment : {"none", "origin", "origin-yaw", "se2", "sim2", "se3"}
         How a track is laid upon the reference; see :func:`marcha.replay.alignment.align`.
     max_gap_s : float
         Reference samples farther apart are not interpolated between.
@@ -165,6 +166,9 @@ def evaluate(
         (``turn`` for ``<run>/turn``) comes before one of this name.
     annotations : polars.DataFrame, optional
         To be used instead of those of the recording.
+    survey : Recording, optional
+        Of the same route walked another time (``/reference/fix``, else its only fixes): tracks are measured by
+        their distance to its line.
 
     Returns
     -------
@@ -195,6 +199,7 @@ def evaluate(
             max_gap_s=max_gap_s,
             reference=reference,
             truth=truth,
+            survey=survey,
         )
         for run, lineage in lineages.items()
         if runs is None or run in runs
@@ -220,6 +225,7 @@ def recording_view(
     max_gap_s: float = 0.1,
     reference: str | None = None,
     truth: Mapping[str, str] | None = None,
+    survey: Recording | None = None,
 ) -> RunView:
     """Return what the metrics of one run look at: its tables in memory, or those of the recording.
 
@@ -233,7 +239,7 @@ def recording_view(
         Results by output.
     start_ns, end_ns : int, optional
         Range of the replay; a walk's length says nothing of a part of it.
-    alignment, max_gap_s, reference, truth
+    alignment, max_gap_s, reference, truth, survey
         As in :func:`evaluate`.
     """
     run = lineage["run"]
@@ -267,7 +273,20 @@ def recording_view(
         chosen_reference=reference,
         alignment=alignment,
         max_gap_s=max_gap_s,
+        reference_frame=rec.channels[track].frame_id if rec is not None and track is not None else "",
+        survey=None if survey is None else _surveyed(survey),
     )
+
+
+def _surveyed(rec: Recording) -> pl.DataFrame:
+    """Return the places of a survey."""
+    fixes = [
+        t for t, c in rec.channels.items() if c.schema in KINDS["fix"] and not t.startswith("/estimate/")
+    ]
+    own = references(rec.channels, "fix") or fixes
+    if len(own) != 1:
+        raise UsageError(f"{rec.path}: is no survey: it has {len(own)} channels of fixes, a survey has one")
+    return rec.table(own[0])
 
 
 def _track_references(rec: Recording, input_topic: str, chosen: str | None) -> tuple[str | None, str | None]:

@@ -39,11 +39,16 @@ def closure(view: RunView) -> dict[str, float]:
 
 def distance(view: RunView) -> dict[str, float]:
     """Way walked, horizontal: from stance to stance, and along the raw track (the source's ED, eq 4.4)."""
+    found: dict[str, float] = {}
+    steps = view.table("step")
+    if steps is not None:
+        found["steps"] = float(steps.height)
+        if view.truth.steps:
+            found["steps_error_percent"] = 100.0 * abs(steps.height - view.truth.steps) / view.truth.steps
     base = view.whole or view
     track = base.track
     if track is None:
-        return {}
-    found: dict[str, float] = {}
+        return found
     first, last = track.t_ns[0], track.t_ns[-1]
     stances = base.stances[(base.stances[:, 1] >= first) & (base.stances[:, 0] <= last)]
     # The track begins within the rest at the start: that stance counts from where there is a track.
@@ -52,11 +57,6 @@ def distance(view: RunView) -> dict[str, float]:
     if at.size:
         found["distance_m"] = _length(middles, track.position[at], view.spans)
     found["path_m"] = _length(track.t_ns, track.position, view.spans)
-    steps = view.table("step")
-    if steps is not None:
-        found["steps"] = float(steps.height)
-        if view.truth.steps:
-            found["steps_error_percent"] = 100.0 * abs(steps.height - view.truth.steps) / view.truth.steps
     if (length := view.truth.length_m) is not None:
         for name, metres in (
             ("distance_error_percent", found.get("distance_m")),

@@ -154,12 +154,24 @@ class RecordingSource:
         As :func:`marcha.recording.open` gives it.
     max_rows : int
         Largest number of rows in a batch; bounds memory.
+    withheld : mapping of str to sequence of (int, int), optional
+        Messages that are kept back, by topic: from when to when (log time in ns, half open).
     """
 
     seekable = True
 
-    def __init__(self, recording: Recording, max_rows: int = 65_536) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        max_rows: int = 65_536,
+        withheld: Mapping[str, Sequence[tuple[int, int]]] | None = None,
+    ) -> None:
         self.recording = recording
+        self.withheld = dict(withheld or {})
+        for topic in self.withheld:
+            if topic not in recording.channels:
+                there = ", ".join(recording.channels) or "none"
+                raise UsageError(f"{recording.path}: no channel {topic} to withhold; there are {there}")
         self.name = Path(recording.path).name
         self.max_rows = max_rows
         self.channels: dict[str, PlannedChannel] = {
@@ -204,8 +216,13 @@ class RecordingSource:
             ahead=False,  # the engine has a thread for all of this
         )
         for window in windows:
-            tables = {t: window.tables[t] for t in order if t in window.tables and window.tables[t].height}
-            yield Batch(window.end_ns, tables)
+            tables = {t: self._left(t, window.tables[t]) for t in order if t in window.tables}
+            yield Batch(window.end_ns, {t: table for t, table in tables.items() if table.height})
+
+    def _left(self, topic: str, table: pl.DataFrame) -> pl.DataFrame:
+        for start, end in self.withheld.get(topic, ()):
+            table = table.filter((pl.col("t_log_ns") < start) | (pl.col("t_log_ns") >= end))
+        return table
 
 
 class LiveSource:

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 POSITION = ("pos_x", "pos_y", "pos_z")
 QUATERNION = ("quat_w", "quat_x", "quat_y", "quat_z")
 VELOCITY = ("vel_x", "vel_y", "vel_z")
+PLAN = "plan"
+REST_NS = 500_000_000
+"""How long beyond what was recorded a walker is taken to stay where he was."""
 Loader = Callable[[str, "Sequence[str] | None"], "pl.DataFrame | None"]
 
 
@@ -200,6 +203,10 @@ class RunView:
         Stretches of time that are looked at: half open, apart, in order. None: all.
     whole : RunView or None
         Of a part: the view of the whole walk, whose alignment holds.
+    reference_frame : str
+        Frame of the reference track's channel; on a ``plan`` heights say nothing.
+    survey : polars.DataFrame or None
+        Places (``lat_deg, lon_deg``) along the route from another recording, whose times say nothing here.
     """
 
     run: str
@@ -215,6 +222,8 @@ class RunView:
     max_gap_s: float = 0.1
     spans: IntArray | None = None
     whole: RunView | None = None
+    reference_frame: str = ""
+    survey: pl.DataFrame | None = None
     _cache: dict[Any, pl.DataFrame | None] = field(default_factory=dict, repr=False)
     _comparisons: dict[str, Comparison | None] = field(default_factory=dict, repr=False)
 
@@ -296,6 +305,15 @@ class RunView:
         """Whether several stretches are looked at, so that there is no first and last."""
         return self.spans is not None and len(self.spans) > 1
 
+    @property
+    def input_span(self) -> tuple[int | None, int | None]:
+        """Log times of the first and last message of the run's first input; None where that is not known."""
+        topic = self.lineage.get("input", "")
+        if self.recording is None or topic not in self.recording.channels:
+            return None, None
+        channel = self.recording.channels[topic]
+        return channel.start_ns, channel.end_ns
+
     @cached_property
     def track(self) -> Trajectory | None:
         """The estimated track: of the output ``pose``, else of ``position``."""
@@ -339,9 +357,14 @@ def compare(view: RunView, alignment: str) -> Comparison | None:
     track, reference = view.track, view.reference_track
     if track is None or reference is None:
         return None
-    sparse = len(reference) > 1 and float(np.median(np.diff(reference.t_ns))) > view.max_gap_s * 1e9
+    if view.reference_frame == PLAN:
+        track, reference = _flat(track), _flat(reference)
+    sparse = _is_sparse(reference, view.max_gap_s)
+    max_gap_s = view.max_gap_s
+    if sparse and _is_sparse(track, max_gap_s) and (steps := view.table("step")) is not None:
+        track, max_gap_s = stepwise(track, steps, *view.input_span), np.inf
     kept, other = (reference, track) if sparse else (track, reference)
-    found = match(kept.t_ns, other.t_ns, view.max_gap_s)
+    found = match(kept.t_ns, other.t_ns, max_gap_s)
     if not len(found.index):
         return None
     here, there = kept.position[found.index], found.linear(other.position)
@@ -366,3 +389,45 @@ def compare(view: RunView, alignment: str) -> Comparison | None:
         float(yaw_error[0]) if yaw_error is not None else 0.0,
         np.delete(kept.t_ns, found.index),
     )
+
+
+def _is_sparse(track: Trajectory, max_gap_s: float) -> bool:
+    return len(track) > 1 and float(np.median(np.diff(track.t_ns))) > max_gap_s * 1e9
+
+
+def _flat(track: Trajectory) -> Trajectory:
+    return replace(track, position=track.position * (1.0, 1.0, 0.0))
+
+
+def stepwise(track: Trajectory, steps: pl.DataFrame, first_ns: int | None, last_ns: int | None) -> Trajectory:
+    """Return a track that is known at the ends of steps, as a walk that stands still between them.
+
+    Parameters
+    ----------
+    track : Trajectory
+        Positions at the ends of steps, and in between.
+    steps : polars.DataFrame
+        ``start_ns, end_ns, length_m, heading_rad`` of every step, in order.
+    first_ns, last_ns : int or None
+        From when to when the walker was watched: there is a place before the first step and after the last,
+        and for :data:`REST_NS` beyond, in which nobody gets far.
+    """
+    t, place = track.t_ns, track.position
+    start = steps["start_ns"].to_numpy() if "start_ns" in steps.columns else np.empty(0, np.int64)
+    if not len(start):
+        return track
+    before = np.searchsorted(t, start, "right") - 1  # where the walker stood when the step began
+    rests = np.flatnonzero((before >= 0) & (t[before] < start))
+    times, places = [t, start[rests]], [place, place[before[rests]]]
+    if start[0] < t[0] <= steps["end_ns"][0]:
+        length, heading = steps["length_m"][0], steps["heading_rad"][0]
+        at = place[0] - length * np.array([np.cos(heading), np.sin(heading), 0.0])
+        times.append(start[:1])
+        places.append(at[None])
+    t, index = np.unique(np.concatenate(times), return_index=True)
+    place = np.concatenate(places)[index]
+    if last_ns is not None and last_ns + REST_NS > t[-1]:
+        t, place = np.append(t, last_ns + REST_NS), np.vstack((place, place[-1:]))
+    if first_ns is not None and first_ns - REST_NS < t[0]:
+        t, place = np.insert(t, 0, first_ns - REST_NS), np.vstack((place[:1], place))
+    return Trajectory(t, place)

@@ -107,7 +107,8 @@ class PdrParams(LengthParams, frozen=True, forbid_unknown_fields=True, kw_only=T
     sigma_drift: Annotated[
         float,
         meta(
-            "Bias of the gyroscope about the vertical that is left (a tenth of it where the field is followed)",
+            "Bias of the gyroscope about the vertical that is left (a tenth of it where the field is followed; "
+            "below 30 Hz more in proportion, since the hand's own motion is then integrated badly)",
             "rad/s",
             "ours",
             ge=0.0,
@@ -182,7 +183,7 @@ class PhoneTrack(KernelEstimator):
             heading_known=not ringed,
             sigma_heading=sigma,
             sigma_scale=p.sigma_scale,
-            sigma_drift=p.sigma_drift if s["tau_mag"] > 1e4 or not s["has_mag"] else 0.1 * p.sigma_drift,
+            sigma_drift=drift_sd(p, rate) * (1.0 if s["tau_mag"] > 1e4 or not s["has_mag"] else 0.1),
         )
         if ringed and s["has_mag"]:
             mixture.weigh(s, 0.0, sigma, 0.2)
@@ -262,6 +263,11 @@ class PhoneTrack(KernelEstimator):
         return found
 
 
+def drift_sd(p: PdrParams, rate_hz: float) -> float:
+    """Return the standard deviation of the gyroscope's bias about the vertical (rad/s) at this rate."""
+    return p.sigma_drift * max(1.0, 30.0 / rate_hz)
+
+
 def calibrated_field(context: Context) -> float | None:
     """Return the field's strength (T; 0 unknown) by the calibration of the attached magnetometer, None without one.
 
@@ -308,7 +314,7 @@ class PhonePdr(PhoneTrack):
     source: ClassVar[str] = "phone dissertation, eq 3.20; attitude: Laidig and Seel 2023; the rest ours"
     Params = PdrParams
     inputs = (GYR, ACC, MAG, PRESSURE)
-    outputs = (STEP, POSE, SIGMA, HEADING, DETECTOR)
+    outputs = (STEP, POSE, SIGMA, HEADING, DETECTOR, STATE)
 
 
 class SourceParams(PdrParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -343,7 +349,7 @@ class PhonePdrSource(PhoneTrack):
     source: ClassVar[str] = "phone dissertation, eqs 3.1–3.20"
     Params = SourceParams
     inputs = (ACC, Input("mag", MAG.schema, MAG.columns, regular=True))
-    outputs = (STEP, POSE, SIGMA, HEADING, DETECTOR)
+    outputs = (STEP, POSE, SIGMA, HEADING, DETECTOR, STATE)
 
 
 class PhoneFused(PhoneTrack):
@@ -360,5 +366,5 @@ class PhoneFused(PhoneTrack):
     source: ClassVar[str] = "ours; data association: Bar-Shalom et al. 2009"
     Params = PhoneFusedParams
     inputs = (GYR, ACC, MAG, PRESSURE, GNSS)
-    outputs = (STEP, POSE, SIGMA, HEADING, DETECTOR, FIX, STATE)
+    outputs = (STEP, POSE, SIGMA, HEADING, DETECTOR, STATE, FIX)
     fused: ClassVar[bool] = True

@@ -2,7 +2,7 @@
 
 ‖f‖ is averaged into cells of 20 ms whatever the rate, so that the same filter and windows serve 10 and 500 Hz.
 A symmetric band-pass (1.2 to 3 Hz) delays by a constant time that is taken off again: a step's time has no phase
-error. Peaks count when they are as high, and as regular, as steps are: a bout of walking is one when five
+error. Peaks count when they are as high, and as regular, as steps are: a bout of walking is one when four
 peaks in a row keep time and the signal repeats itself; its first steps are then made known together, late. Peaks of a
 bout that are much lower than its others are none (ringing of the filter at the ends, a swinging arm's second
 wave).

@@ -11,7 +11,7 @@ import numpy as np
 from ..contract import ALL_COLUMNS, Context, FloatArray, IntArray, Message, PlainEstimator, Remark, Result
 from ..numerics.compiled import compiled
 from . import geodesy
-from .pdr import FIX, POSE, SIGMA, PhoneFused, PhoneFusedParams
+from .pdr import FIX, POSE, SIGMA, STATE, PhoneFused, PhoneFusedParams, drift_sd
 from .steps import STEP
 
 N = 7
@@ -201,7 +201,7 @@ class PhoneSmooth(PlainEstimator):
     offline: ClassVar[bool] = True
     Params = PhoneFusedParams
     inputs = PhoneFused.inputs
-    outputs = (STEP, POSE, SIGMA, FIX)
+    outputs = (STEP, POSE, SIGMA, STATE, FIX)
 
     def __init__(self, params: msgspec.Struct | None = None) -> None:
         super().__init__(params)
@@ -209,10 +209,13 @@ class PhoneSmooth(PlainEstimator):
         self._messages: list[tuple[int, int, tuple[Any, ...]]] = []
         self._columns: dict[int, tuple[str, ...]] = {}
         self._failed = ""
+        self._noise: PhoneFusedParams = self.params
 
     def start(self, context: Context) -> None:
         """Hand the context to the forward pass."""
         self._forward.start(context)
+        rate = self.params.rate_hz or context.rate_hz("acc") or 50.0
+        self._noise = msgspec.structs.replace(self.params, sigma_drift=drift_sd(self.params, rate))
         self._messages = []
         self._columns = {
             i: context.channels[one.name][0].columns if one.columns == ALL_COLUMNS else one.columns
@@ -298,7 +301,7 @@ class PhoneSmooth(PlainEstimator):
         seen[np.searchsorted(t_ns, fix_times)] = np.column_stack((place, sd))
         settled = [c[0] for _, _, c in steps[len(steps) // 2 :]] or [0.0]
         drift = math.atan2(np.mean(np.sin(settled)), np.mean(np.cos(settled)))
-        done = smooth(WalkEvents(t_ns, walked, seen), drift, p)
+        done = smooth(WalkEvents(t_ns, walked, seen), drift, self._noise)
         if not np.isfinite(done.state).all():
             self._failed = "the smoother diverged"
             return []
@@ -315,6 +318,8 @@ class PhoneSmooth(PlainEstimator):
     ) -> list[Result]:
         s, out = self._forward.state[0], []
         at_step = {t: k for k, (t, _, _) in enumerate(steps)}
+        fixes = float(s["fixes"])
+        outliers = max(0.0, fixes - float(done.inlier.sum()))
         turn, sd = 0.0, np.sqrt(np.maximum(np.diagonal(done.cov, axis1=1, axis2=2), 0))
         for k, t in enumerate(t_ns.tolist()):
             x = done.state[k]
@@ -328,6 +333,8 @@ class PhoneSmooth(PlainEstimator):
             out.append(Result("pose", t, (x[0], x[1], z, *quat)))
             nan = float("nan")
             out.append(Result("sigma", t, (sd[k, 0], sd[k, 1], nan, nan, nan, min(sd[k, 2], math.pi))))
+            together = done.cov[k, 0, 1] / max(sd[k, 0] * sd[k, 1], 1e-12)
+            out.append(Result("state", t, (x[2], math.exp(x[3]), 1.0, together, fixes, outliers)))
             lat, lon, _ = _globe(s, x[0], x[1])
             alt = float(s["alt_zero"]) + z if s["alt_n"] > 0 else nan
             high = 10.0 if s["alt_n"] > 0 else nan

@@ -66,7 +66,7 @@ class PhoneStepParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     ] = 0.5
     run_min: Annotated[
         int, meta("best: peaks in a row that make a bout of walking", "1", "ours", ge=4, le=12)
-    ] = 5
+    ] = 4
     # peaks, gates, tied, zero-crossing, threshold
     window_s: Annotated[
         float,

@@ -59,11 +59,10 @@ FIELDS: list[tuple[Any, ...]] = [
     ("alt_zero", "f8"),
 ]
 
-# Columns of the result vector: step, pose, sigma, heading, detector, and of fused fix and state.
+# Columns of the result vector: step, pose, sigma, heading, detector, state, and of fused the fix.
 O_STEP, O_POSE, O_SIGMA, O_HEADING, O_DETECTOR = 0, 5, 12, 18, 23
-O_FIX = O_DETECTOR + ring.N_FEATURES
-O_STATE = O_FIX + 6
-WIDTH_PDR, WIDTH_FUSED = O_FIX, O_STATE + 6
+O_STATE = O_DETECTOR + ring.N_FEATURES
+O_FIX = O_STATE + 6
 
 
 @compiled
@@ -158,11 +157,10 @@ def _write_track(s: Any, t_ns: int, at: int, out_message: Any, out_t_ns: Any, ou
             out[k, O_FIX + 2] = s.alt_zero + s.height
             out[k, O_FIX + 5] = 10.0
         out[k, O_FIX + 3], out[k, O_FIX + 4] = out[k, O_SIGMA], out[k, O_SIGMA + 1]
-    if s.fused == 1:
-        out[k, O_STATE], out[k, O_STATE + 1] = s.mean[2], math.exp(s.mean[3])
-        out[k, O_STATE + 2] = s.hyp
-        out[k, O_STATE + 3] = s.cov[1] / math.sqrt(max(s.cov[0] * s.cov[2], 1e-12))
-        out[k, O_STATE + 4], out[k, O_STATE + 5] = s.fixes, s.outliers
+    out[k, O_STATE], out[k, O_STATE + 1] = s.mean[2], math.exp(s.mean[3])
+    out[k, O_STATE + 2] = s.hyp
+    out[k, O_STATE + 3] = s.cov[1] / math.sqrt(max(s.cov[0] * s.cov[2], 1e-12))
+    out[k, O_STATE + 4], out[k, O_STATE + 5] = s.fixes, s.outliers
 
 
 @compiled

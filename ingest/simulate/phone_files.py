@@ -13,7 +13,7 @@ import polars as pl
 
 from ...recording.errors import MarchaError, OutputExists, UsageError
 from .phone import PhoneWalk, phone_walk
-from .phone_world import RADIAL_68
+from .phone_world import RADIAL_68, geodetic
 
 PHONE_FORMATS = ("android-text", "phyphox", "sensor-logger")
 
@@ -32,7 +32,7 @@ def write_phone(
 
     Files: ``phone-<name>.txt``, or a folder ``phone-<name>`` as the app exports it; ``….truth.csv`` (the walker's
     place on the ground in east, true north, up; the phone's attitude; ``still`` while nobody walks),
-    ``….truth.steps.csv`` (a row a step) and ``….truth.toml``.
+    ``….truth.steps.csv`` (a row a step), ``….truth.fix.csv`` (the same place on the Earth) and ``….truth.toml``.
 
     Raises
     ------
@@ -48,7 +48,7 @@ def write_phone(
     walk = phone_walk(scenario, seed=seed, **options)
     stem = name or f"{scenario}-{seed:03d}"
     log = folder / (f"{stem}.txt" if format == "android-text" else stem)
-    truths = [folder / f"{stem}.truth{part}" for part in (".csv", ".steps.csv", ".toml")]
+    truths = [folder / f"{stem}.truth{part}" for part in (".csv", ".steps.csv", ".fix.csv", ".toml")]
     for path in (log, *truths):
         if path.exists() and not overwrite:
             raise OutputExists(path)
@@ -61,7 +61,8 @@ def write_phone(
             _truth(walk, origin).write_csv(part / truths[0].name)
             steps = walk.steps.with_columns(pl.col("start_ns") - origin, pl.col("end_ns") - origin)
             steps.write_csv(part / truths[1].name)
-            (part / truths[2].name).write_bytes(msgspec.toml.encode(_facts(walk, format)))
+            _truth_places(walk, origin).write_csv(part / truths[2].name)
+            (part / truths[3].name).write_bytes(msgspec.toml.encode(_facts(walk, format)))
             for path in (log, *truths):
                 if path.is_dir():
                     shutil.rmtree(path)
@@ -157,6 +158,15 @@ def _truth(walk: PhoneWalk, origin: int) -> pl.DataFrame:
     columns |= dict(zip(("quat_w", "quat_x", "quat_y", "quat_z"), walk.quat_wxyz.T, strict=True))
     columns |= dict(zip(("vel_x", "vel_y", "vel_z"), walk.vel.T, strict=True))
     return pl.DataFrame(columns | {"still": (~walk.walking).astype(np.int8)})
+
+
+def _truth_places(walk: PhoneWalk, origin: int) -> pl.DataFrame:
+    """Return the walker's place on the Earth, five times a second."""
+    every = max(1, round(walk.options.rate_hz / 5))
+    place = walk.pos[::every]
+    lat, lon = geodetic(walk.options, place)
+    alt = walk.options.alt_m + place[:, 2]
+    return pl.DataFrame({"t_ns": walk.t_ns[::every] - origin, "lat_deg": lat, "lon_deg": lon, "alt_m": alt})
 
 
 def _facts(walk: PhoneWalk, format: str) -> dict[str, Any]:

@@ -63,7 +63,6 @@ def fixes_of(
     walker: Walker, o: PhoneOptions, start_ns: int, end_s: float, rng: np.random.Generator
 ) -> pl.DataFrame:
     """Return the fixes: truth, a slow first-order Gauss-Markov error and a white one, losses, outliers."""
-    from pyproj import Geod
     from scipy.signal import lfilter
 
     rate = o.gnss_hz
@@ -84,18 +83,13 @@ def fixes_of(
         lost |= (t >= begin) & (t < begin + length)
     reported = (truth + error)[~lost]
     sigma = float(np.hypot(o.gnss_sigma_m, o.gnss_noise_m))
-    lon, lat, _ = Geod(ellps="WGS84").fwd(
-        np.full(len(reported), o.lon_deg),
-        np.full(len(reported), o.lat_deg),
-        np.degrees(np.arctan2(reported[:, 0], reported[:, 1])),
-        np.hypot(reported[:, 0], reported[:, 1]),
-    )
+    lat, lon = geodetic(o, reported)
     one = np.full(len(reported), sigma)
     return pl.DataFrame(
         {
             "t_ns": start_ns + np.round(t[~lost] * 1e9).astype(np.int64),
-            "lat_deg": np.asarray(lat, dtype=np.float64),
-            "lon_deg": np.asarray(lon, dtype=np.float64),
+            "lat_deg": lat,
+            "lon_deg": lon,
             "alt_m": o.alt_m + reported[:, 2],
             "sd_east_m": one,
             "sd_north_m": one,
@@ -105,6 +99,19 @@ def fixes_of(
             "up_m": truth[~lost, 2],
         }
     )
+
+
+def geodetic(o: PhoneOptions, place: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return latitude and longitude (deg) of places east and north of the start (m), shape (n, ≥ 2)."""
+    from pyproj import Geod
+
+    lon, lat, _ = Geod(ellps="WGS84").fwd(
+        np.full(len(place), o.lon_deg),
+        np.full(len(place), o.lat_deg),
+        np.degrees(np.arctan2(place[:, 0], place[:, 1])),
+        np.hypot(place[:, 0], place[:, 1]),
+    )
+    return np.asarray(lat, dtype=np.float64), np.asarray(lon, dtype=np.float64)
 
 
 def pressure_of(

@@ -1,0 +1,358 @@
+"""Figures of tracks on the Earth: beside fixes of the same time, a survey of another time, withheld fixes.
+
+Distances are horizontal, in metres of the tangent plane at the first place compared; nothing is aligned but where
+a name says so. What a run states of itself (``fix``: latitude, longitude, deviations; ``state``: correlation) is
+measured beside its errors.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from ..algorithms.contract import AlgorithmError, FloatArray
+from ..algorithms.phone.horn import horn
+from .alignment import IntArray, match
+from .view import stepwise, track_of
+
+if TYPE_CHECKING:
+    from .view import RunView
+
+ELLIPSE95 = 5.991464547107979
+"""95 % quantile of the chi-square distribution with two degrees of freedom."""
+REFERENCE_GAP_S = 2.5
+"""Fixes of a reference farther apart are not interpolated between."""
+LINE_GAP_M = 20.0
+"""Places of a survey farther apart are not joined: nobody knows how the route went there."""
+END_M = 2.0
+SHAPE_ROUNDS = 60
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where a run says that it was, in a tangent plane.
+
+    Attributes
+    ----------
+    t_ns : ndarray of int64, shape (n,)
+        Ascending.
+    xy : ndarray, shape (n, 2)
+        East, north (m).
+    cov : ndarray, shape (n, 2, 2)
+        What the run states of their errors (m²); NaN where it states nothing.
+    """
+
+    t_ns: IntArray
+    xy: FloatArray
+    cov: FloatArray
+
+
+class Plane:
+    """The tangent plane at a place on WGS 84: east and north in metres, by PROJ."""
+
+    def __init__(self, lat_deg: float, lon_deg: float) -> None:
+        from pyproj import Transformer
+
+        self._transform = Transformer.from_pipeline(
+            "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+            f"+step +proj=topocentric +ellps=WGS84 +lat_0={lat_deg!r} +lon_0={lon_deg!r} +h_0=0"
+        )
+
+    def __call__(self, table: pl.DataFrame) -> FloatArray:
+        """Return east and north of ``lat_deg, lon_deg``, shape (n, 2)."""
+        lat, lon = table["lat_deg"].to_numpy(), table["lon_deg"].to_numpy()
+        east, north, _ = self._transform.transform(lon, lat, np.zeros(len(lat)))
+        return np.column_stack((east, north))
+
+
+def places(view: RunView) -> dict[str, float]:
+    """Errors of a run's places (``fix``) against fixes of a reference, a survey's line, withheld fixes."""
+    ours = usable(view.table("fix"))
+    if ours is None:
+        return waypoint_ellipse(view)
+    plane = Plane(ours["lat_deg"][0], ours["lon_deg"][0])
+    track = Places(ours["t_ns"].to_numpy(), plane(ours), _stated(ours, view.table("state")))
+    raw = _raw_fixes(view)
+    found: dict[str, float] = {}
+    reference = usable(view.reference_table("fix")) if view.recording is not None else None
+    survey = usable(view.survey)
+    if reference is not None:
+        there = reference["t_ns"].to_numpy()
+        if there[0] <= track.t_ns[-1] and track.t_ns[0] <= there[-1]:
+            found |= _beside(track, there, plane(reference), "fix_error")
+            if raw is not None:
+                found |= _errors(
+                    _against(raw["t_ns"].to_numpy(), plane(raw), there, plane(reference))[0], "raw_fix_error"
+                )
+        elif survey is None:
+            survey = reference
+    if survey is not None and (line := Line.through(plane(survey))) is not None:
+        found |= _along(track, line, None if raw is None else plane(raw))
+    return found | _losses(view, track, plane, reference)
+
+
+def usable(table: pl.DataFrame | None) -> pl.DataFrame | None:
+    """Return the rows that have a place, in the order of time, a time once; None where there are none."""
+    if table is None or not {"lat_deg", "lon_deg"} <= set(table.columns):
+        return None
+    good = pl.col("lat_deg").is_finite() & pl.col("lon_deg").is_finite()
+    if "status" in table.columns:
+        good &= pl.col("status").fill_null(0) >= 0
+    table = (
+        table.filter(good).sort("t_ns", maintain_order=True).unique("t_ns", keep="last", maintain_order=True)
+    )
+    return None if table.is_empty() else table
+
+
+def _raw_fixes(view: RunView) -> pl.DataFrame | None:
+    topics = view.inputs.get("gnss", ())
+    table = usable(view.raw(topics[0])) if topics else None
+    for bound, inside in (("start_ns", pl.col("t_ns").ge), ("end_ns", pl.col("t_ns").lt)):
+        if table is not None and (limit := view.lineage.get(f"range.{bound}")):
+            table = table.filter(inside(int(limit)))
+    return table
+
+
+def _stated(
+    table: pl.DataFrame, state: pl.DataFrame | None, sd: tuple[str, str] = ("sd_east_m", "sd_north_m")
+) -> FloatArray:
+    """Return the covariances that a run states, shape (n, 2, 2)."""
+    cov = np.full((table.height, 2, 2), np.nan)
+    if not set(sd) <= set(table.columns):
+        return cov
+    east, north = (table[c].cast(pl.Float64).fill_null(np.nan).to_numpy() for c in sd)
+    together = np.zeros(table.height)
+    if state is not None and "correlation_en" in state.columns:
+        state = state.unique("t_ns", keep="last", maintain_order=True)
+        joined = table.select("t_ns").join(state.select("t_ns", "correlation_en"), on="t_ns", how="left")
+        together = joined["correlation_en"].fill_null(0.0).to_numpy()
+    cov[:, 0, 0], cov[:, 1, 1] = east**2, north**2
+    cov[:, 0, 1] = cov[:, 1, 0] = np.clip(together, -0.9999, 0.9999) * east * north
+    return cov
+
+
+def squared(error: FloatArray, cov: FloatArray) -> FloatArray:
+    """Return the normalized errors squared eᵀ P⁻¹ e of shape (n,); NaN where P is not positive definite."""
+    out = np.full(len(error), np.nan)
+    det = cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2
+    known = np.isfinite(det) & (det > 0) & (cov[:, 0, 0] > 0)
+    x, y = error[known, 0], error[known, 1]
+    a, b, c = cov[known, 0, 0], cov[known, 0, 1], cov[known, 1, 1]
+    out[known] = (c * x * x - 2 * b * x * y + a * y * y) / det[known]
+    return out
+
+
+def _against(
+    t_ns: IntArray, xy: FloatArray, there: IntArray, reference: FloatArray
+) -> tuple[FloatArray, IntArray]:
+    """Return errors at the times that the reference has, and which they are."""
+    found = match(t_ns, there, REFERENCE_GAP_S)
+    return xy[found.index] - found.linear(reference), found.index
+
+
+def _errors(error: FloatArray, name: str) -> dict[str, float]:
+    if not len(error):
+        return {}
+    size = np.hypot(*error.T)
+    return {
+        f"{name}_mean_m": float(size.mean()),
+        f"{name}_median_m": float(np.median(size)),
+        f"{name}_p75_m": float(np.percentile(size, 75)),
+        f"{name}_p95_m": float(np.percentile(size, 95)),
+        f"{name}_max_m": float(size.max()),
+        f"{name}_end_m": float(size[-1]),
+    }
+
+
+def _beside(track: Places, there: IntArray, reference: FloatArray, name: str) -> dict[str, float]:
+    error, index = _against(track.t_ns, track.xy, there, reference)
+    return _errors(error, name) | _consistency(error, track.cov[index])
+
+
+def _consistency(error: FloatArray, cov: FloatArray) -> dict[str, float]:
+    """Return how the errors fit what is stated of them."""
+    ratio = squared(error, cov)
+    known = np.isfinite(ratio)
+    if not known.any():
+        return {}
+    return {
+        "ellipse95_percent": float(100.0 * np.mean(ratio[known] <= ELLIPSE95)),
+        "nees_horizontal": float(ratio[known].mean()),
+        "nees_horizontal_end": float(ratio[known][-1]),
+    }
+
+
+def waypoint_ellipse(view: RunView) -> dict[str, float]:
+    """Share of surveyed points inside the 95 % ellipse of a track that is laid on the first of them."""
+    sigma = view.table("sigma")
+    if sigma is None or not {"sigma_pos_x", "sigma_pos_y"} <= set(sigma.columns):
+        return {}
+    compared = view.compared("origin")
+    if compared is None or compared.on_estimate or len(compared.t_ns) < 2:
+        return {}
+    cov = _stated(sigma, view.table("state"), ("sigma_pos_x", "sigma_pos_y"))
+    at = np.searchsorted(sigma["t_ns"].to_numpy(), compared.t_ns, "right") - 1
+    later = at[1:] >= 0  # the first one has no error by definition
+    begin = cov[at[0]] if at[0] >= 0 else np.zeros((2, 2))
+    grown = cov[np.maximum(at[1:], 0)] - begin
+    return _consistency(compared.error[1:, :2][later], grown[later])
+
+
+# -- survey -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Line:
+    """A surveyed route: pieces that hang together but for where places lie far apart.
+
+    Attributes
+    ----------
+    pieces : ndarray, shape (n, 2, 2)
+        Begin and end of each (m).
+    ends : ndarray, shape (k, 2)
+        Where the route begins, ends or is interrupted.
+    """
+
+    pieces: FloatArray
+    ends: FloatArray
+
+    @classmethod
+    def through(cls, xy: FloatArray) -> Line | None:
+        """Return the line through places in the order in which they were surveyed; None where there is none."""
+        xy = xy[np.concatenate(([True], np.hypot(*np.diff(xy, axis=0).T) > 0))]
+        joined = np.hypot(*np.diff(xy, axis=0).T) <= LINE_GAP_M
+        if not joined.any():
+            return None
+        before, after = np.concatenate(([False], joined[:-1])), np.concatenate((joined[1:], [False]))
+        ends = np.vstack((xy[:-1][joined & ~before], xy[1:][joined & ~after]))
+        return cls(np.stack((xy[:-1], xy[1:]), axis=1)[joined], ends)
+
+    def nearest(self, points: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """Return the nearest places on the line, (n, 2), and whether the points lie beside it, (n,).
+
+        A point whose nearest place is an end of the line lies beyond it, where nothing is known. Whoever
+        surveys stands still at an end: places within :data:`END_M` of it are the end.
+        """
+        begin, way = self.pieces[:, 0], self.pieces[:, 1] - self.pieces[:, 0]
+        length = np.maximum((way**2).sum(axis=1), 1e-12)
+        out = np.empty_like(points)
+        for k, p in enumerate(points):
+            part = np.clip(((p - begin) * way).sum(axis=1) / length, 0.0, 1.0)
+            on = begin + part[:, None] * way
+            out[k] = on[np.argmin(((on - p) ** 2).sum(axis=1))]
+        at_end = (np.hypot(*(out[:, None] - self.ends).transpose(2, 0, 1)) < END_M).any(axis=1)
+        return out, ~(at_end & (np.hypot(*(points - out).T) > END_M))
+
+
+def by_shape(points: FloatArray, line: Line) -> FloatArray:
+    """Return the points moved and turned, without scale, so that they lie on a line as well as they can.
+
+    Nearest places and Horn's transform in turn (iterative closest point, Besl and McKay 1992), from where the
+    points are. Points beyond the ends of the line move with the others and have no say.
+    """
+    moved = points
+    for _ in range(SHAPE_ROUNDS):
+        there, inside = line.nearest(moved)
+        try:
+            found = horn(moved[inside], there[inside], scale=False)
+        except AlgorithmError:
+            return points
+        change = found.apply(moved) - moved
+        moved = moved + change
+        if np.abs(change).max() < 1e-3:
+            break
+    return moved
+
+
+def _along(track: Places, line: Line, raw: FloatArray | None) -> dict[str, float]:
+    """Return distances to a survey's line, without and with alignment by shape, and those of the raw fixes."""
+    found = _off(track.xy, line, "line")
+    found |= _off(by_shape(track.xy, line), line, "line_shape")
+    if raw is not None:
+        found |= _off(raw, line, "raw_line")
+    there, inside = line.nearest(track.xy)
+    found["line_covered_percent"] = float(100.0 * inside.mean())
+    across = _across((track.xy - there)[inside], track.cov[inside])
+    if len(across):
+        found["line_within95_percent"] = float(100.0 * np.mean(across <= 1.959964))
+    return found
+
+
+def _off(points: FloatArray, line: Line, name: str) -> dict[str, float]:
+    there, inside = line.nearest(points)
+    away = np.hypot(*(points - there).T)
+    found = {}
+    for part, chosen in (("", away[inside]), ("_all", away)):
+        if len(chosen):
+            found[f"{name}{part}_median_m"] = float(np.median(chosen))
+            found[f"{name}{part}_p95_m"] = float(np.percentile(chosen, 95))
+    return found
+
+
+def _across(off: FloatArray, cov: FloatArray) -> FloatArray:
+    """Return distances to the line over the deviation that is stated across it."""
+    away = np.hypot(*off.T)
+    known = (away > 1e-9) & np.isfinite(cov).all(axis=(1, 2))
+    normal = off[known] / away[known, None]
+    variance = np.einsum("ni,nij,nj->n", normal, cov[known], normal)
+    return away[known][variance > 0] / np.sqrt(variance[variance > 0])
+
+
+# -- loss of the signal -------------------------------------------------------------------------------------
+
+
+def withheld(view: RunView) -> list[tuple[int, int]]:
+    """Return from when to when (ns) the fixes of a run were withheld from it."""
+    spans = json.loads(view.lineage.get("withheld", "{}"))
+    topics = view.inputs.get("gnss", ())
+    return [(int(a), int(b)) for topic, pairs in spans.items() if topic in topics for a, b in pairs]
+
+
+def _losses(view: RunView, track: Places, plane: Plane, reference: pl.DataFrame | None) -> dict[str, float]:
+    """Return errors at the ends of artificial losses: against the reference, else against what was withheld.
+
+    The estimate is that of the last moment before a fix could help it.
+    """
+    raw = _raw_fixes(view)
+    truth = reference if reference is not None else raw
+    if truth is None or not (spans := withheld(view)):
+        return {}
+    there, xy = truth["t_ns"].to_numpy(), plane(truth)
+    steps = view.table("step")
+    size, ratio = [], []
+    for start, end in spans:
+        before = track.t_ns < end
+        within = np.flatnonzero((there >= start) & (there < end))
+        if not before.any() or not len(within) or there[within[-1]] < end - 1e9 * (REFERENCE_GAP_S + 10):
+            continue
+        at = there[within[-1]]
+        known = Places(track.t_ns[before], track.xy[before], track.cov[before])
+        mine = _at(known, steps, at)
+        error = mine - xy[within[-1]]
+        size.append(float(np.hypot(*error)))
+        ratio.append(squared(error[None], known.cov[-1:])[0])
+    if not size:
+        return {}
+    found = {"loss_error_m": float(np.mean(size)), "loss_error_max_m": float(np.max(size))}
+    if np.isfinite(ratio).any():
+        found["loss_ellipse95_percent"] = float(100.0 * np.mean(np.array(ratio) <= ELLIPSE95))
+    return found
+
+
+def _at(track: Places, steps: pl.DataFrame | None, t_ns: int) -> FloatArray:
+    """Return where a track that goes step by step was at a time; after its end where it ended."""
+    table = pl.DataFrame({"t_ns": track.t_ns, "pos_x": track.xy[:, 0], "pos_y": track.xy[:, 1], "pos_z": 0.0})
+    walk = track_of(table)
+    assert walk is not None
+    if steps is not None and steps.height:
+        steps = steps.filter(pl.col("end_ns") <= int(track.t_ns[-1]))
+        if steps.height:
+            walk = stepwise(walk, steps, None, None)
+    return np.array(
+        [np.interp(t_ns - walk.t_ns[0], walk.t_ns - walk.t_ns[0], walk.position[:, i]) for i in range(2)]
+    )

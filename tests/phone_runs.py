@@ -1,0 +1,79 @@
+"""A phone's estimator over a simulated walk, without files: messages of all sensors in the order of time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import polars as pl
+from marcha.algorithms import make
+from marcha.algorithms.contract import ChannelInfo, Context, KernelEstimator
+from marcha.ingest.simulate import PhoneWalk
+
+FIXES = ("lat_deg", "lon_deg", "alt_m", "sd_east_m", "sd_north_m", "sd_up_m")
+
+
+def sensor_tables(walk: PhoneWalk) -> dict[str, pl.DataFrame]:
+    """Return what each input of a phone's estimator is served with."""
+    t_ns = pl.Series("t_ns", walk.t_ns)
+
+    def table(name: str, values: np.ndarray) -> pl.DataFrame:
+        return pl.DataFrame([t_ns, *(pl.Series(f"{name}_{a}", values[:, i]) for i, a in enumerate("xyz"))])
+
+    return {
+        "acc": table("acc", walk.acc_b),
+        "gyr": table("gyr", walk.gyr_b),
+        "mag": table("mag", walk.mag_b),
+        "pressure": walk.pressure,
+        "gnss": walk.fixes.select("t_ns", *FIXES).with_columns(status=pl.lit(0)),
+    }
+
+
+def run_phone(name: str, tables: dict[str, pl.DataFrame], **params: Any) -> dict[str, pl.DataFrame]:
+    """Return the results of a kernel estimator by output, ``t_ns`` first; all inputs are attached."""
+    estimator: Any = make(name, **params)
+    assert isinstance(estimator, KernelEstimator)
+    attached, parts = {}, []
+    for index, one in enumerate(estimator.inputs):
+        table = tables[one.name]
+        if not table.height:
+            continue
+        t = table["t_ns"].to_numpy()
+        rate = 1e9 * (len(t) - 1) / (t[-1] - t[0]) if len(t) > 1 else 0.0
+        columns = tuple(c for c in table.columns if c != "t_ns")
+        attached[one.name] = (ChannelInfo(f"/phone/{one.name}", one.schema, columns=columns, rate_hz=rate),)
+        parts.append((index, t, estimator.encode(index, 0, table)))
+    estimator.start(Context(channels=attached))
+    width = max(v.shape[1] for _, _, v in parts)
+    values = np.concatenate(
+        [np.pad(v, ((0, 0), (0, width - v.shape[1])), constant_values=np.nan) for *_, v in parts]
+    )
+    inputs = np.concatenate([np.full(len(t), i) for i, t, _ in parts])
+    times = np.concatenate([t for _, t, _ in parts])
+    order = np.argsort(times, kind="stable")
+    room = 16 * len(times) // 4 + 64
+    whose, when, out = (
+        np.zeros(room, np.int64),
+        np.zeros(room, np.int64),
+        np.full((room, estimator.width), np.nan),
+    )
+    n = estimator.run(
+        estimator.state,
+        inputs[order],
+        np.zeros(len(times), np.int64),
+        times[order],
+        values[order],
+        whose,
+        when,
+        out,
+    )
+    last_t, last = estimator.held()
+    t_ns, rows = np.concatenate((when[:n], last_t)), np.concatenate((out[:n], last))
+    found, first = {}, 0
+    for output in estimator.outputs:
+        part = rows[:, first : first + len(output.columns)]
+        first += len(output.columns)
+        said = ~np.isnan(part[:, 0]) if output.event else ~np.isnan(part).all(axis=1)
+        columns = dict(zip(output.columns, part[said].T, strict=True))
+        found[output.name] = pl.DataFrame({"t_ns": t_ns[said], **columns})
+    return found
