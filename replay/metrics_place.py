@@ -91,7 +91,7 @@ def places(view: RunView) -> dict[str, float]:
                 )
         elif survey is None:
             survey = reference
-    if survey is not None and (line := Line.through(plane(survey))) is not None:
+    if survey is not None and (line := SurveyLine.through(plane(survey))) is not None:
         found |= _along(track, line, None if raw is None else plane(raw))
     return found | _losses(view, track, plane, reference)
 
@@ -207,7 +207,7 @@ def waypoint_ellipse(view: RunView) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class Line:
+class SurveyLine:
     """A surveyed route: pieces that hang together but for where places lie far apart.
 
     Attributes
@@ -222,7 +222,7 @@ class Line:
     ends: FloatArray
 
     @classmethod
-    def through(cls, xy: FloatArray) -> Line | None:
+    def through(cls, xy: FloatArray) -> SurveyLine | None:
         """Return the line through places in the order in which they were surveyed; None where there is none."""
         xy = xy[np.concatenate(([True], np.hypot(*np.diff(xy, axis=0).T) > 0))]
         joined = np.hypot(*np.diff(xy, axis=0).T) <= LINE_GAP_M
@@ -249,7 +249,7 @@ class Line:
         return out, ~(at_end & (np.hypot(*(points - out).T) > END_M))
 
 
-def by_shape(points: FloatArray, line: Line) -> FloatArray:
+def by_shape(points: FloatArray, line: SurveyLine) -> FloatArray:
     """Return the points moved and turned, without scale, so that they lie on a line as well as they can.
 
     Nearest places and Horn's transform in turn (iterative closest point, Besl and McKay 1992), from where the
@@ -269,7 +269,7 @@ def by_shape(points: FloatArray, line: Line) -> FloatArray:
     return moved
 
 
-def _along(track: Places, line: Line, raw: FloatArray | None) -> dict[str, float]:
+def _along(track: Places, line: SurveyLine, raw: FloatArray | None) -> dict[str, float]:
     """Return distances to a survey's line, without and with alignment by shape, and those of the raw fixes."""
     found = _off(track.xy, line, "line")
     found |= _off(by_shape(track.xy, line), line, "line_shape")
@@ -283,7 +283,7 @@ def _along(track: Places, line: Line, raw: FloatArray | None) -> dict[str, float
     return found
 
 
-def _off(points: FloatArray, line: Line, name: str) -> dict[str, float]:
+def _off(points: FloatArray, line: SurveyLine, name: str) -> dict[str, float]:
     there, inside = line.nearest(points)
     away = np.hypot(*(points - there).T)
     found = {}
@@ -330,7 +330,7 @@ def _losses(view: RunView, track: Places, plane: Plane, reference: pl.DataFrame 
         within = np.flatnonzero((there >= start) & (there < end))
         if not before.any() or not len(within) or there[within[-1]] < end - 1e9 * (REFERENCE_GAP_S + 10):
             continue
-        at = there[within[-1]]
+        at = int(there[within[-1]])
         known = Places(track.t_ns[before], track.xy[before], track.cov[before])
         mine = _at(known, steps, at)
         error = mine - xy[within[-1]]

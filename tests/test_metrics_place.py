@@ -107,7 +107,7 @@ def test_distance_to_a_survey_of_another_time_and_beyond_its_ends() -> None:
 
 def test_a_survey_is_not_joined_over_a_gap() -> None:
     places = np.array([[0, 0], [10, 0], [20, 0], [80, 0], [90, 0], [100, 0]], float)
-    line = mp.Line.through(places)
+    line = mp.SurveyLine.through(places)
     assert line is not None
     near, beside = line.nearest(np.array([[15.0, 3.0], [50.0, 1.0], [85.0, -3.0]]))
     assert beside.tolist() == [True, False, True]
@@ -115,7 +115,7 @@ def test_a_survey_is_not_joined_over_a_gap() -> None:
 
 
 def test_alignment_by_shape_moves_and_turns_but_does_not_stretch() -> None:
-    line = mp.Line.through(np.array([[0, 0], [15, 0], [30, 0], [30, 15], [30, 30], [45, 30]], float))
+    line = mp.SurveyLine.through(np.array([[0, 0], [15, 0], [30, 0], [30, 15], [30, 30], [45, 30]], float))
     assert line is not None
     on = np.array([[x, 0.0] for x in range(2, 30, 2)] + [[30.0, y] for y in range(2, 30, 2)])
     turn = np.radians(6.0)

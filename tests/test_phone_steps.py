@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import marcha.recording as mr
 import marcha.replay as rp
@@ -18,7 +19,7 @@ PLACEMENTS = ("hand", "pocket", "bag", "armband", "neck", "swinging")
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason=f"real recordings are not at {DATA}")
 
 
-def steps_of(scenario: str, **options: object) -> tuple[int, int]:
+def steps_of(scenario: str, **options: Any) -> tuple[int, int]:
     """Return how many steps are found, and how many there are."""
     walk = phone_walk(scenario, gnss_hz=0, pressure_hz=0, **options)
     return run_phone("phone.steps", sensor_tables(walk))["step"].height, walk.steps.height
