@@ -244,6 +244,9 @@ def evaluate(
     ]
     lines: list[Heading | TextTable] = [columns_of(figures)]
     lines += [Heading(f"{r['run']}: {r['note']}") for r in runs if r["note"]]
+    for r in runs:
+        for joint in r["cycles"]:
+            lines += _over_the_cycle(r["run"], joint)
     if by is not None:
         for r in runs:
             lines += [Heading(f"\n{r['run']} by {by}"), columns_of(_by_label(r))]
@@ -282,6 +285,20 @@ def _by_label(run: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
             },
         )
         for g in run["groups"]
+    ]
+
+
+def _over_the_cycle(run: str, joint: dict[str, Any]) -> list[Heading | TextTable]:
+    """Return a joint's angle at every tenth of the gait cycle: mean and standard deviation over the cycles."""
+    parts = ("reference", "estimate", "error")
+    rows = [
+        [at, *(joint[f"{part}_{what}"][at] for part in parts for what in ("mean", "sd"))]
+        for at in range(0, 101, 10)
+    ]
+    head = f"\n{run}: {joint['joint']} over {joint['count']} gait cycles (from {joint['starts']}), °"
+    return [
+        Heading(head),
+        TextTable([">cycle [%]", *(f">{p} {w}" for p in parts for w in ("mean", "sd"))], rows),
     ]
 
 

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Annotated, Literal
 
+import msgspec
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from ..recording.errors import MarchaError
+from ..recording.errors import MarchaError, UsageError
+from .anatomy import ReferenceAngles, from_markers
 from .columns import MISSING
-from .contract import ChannelSpec, Import, ReportBuilder
-from .leg import MARKERS, MARKERS_TOPIC, unseen
+from .contract import ChannelSpec, CommonOptions, Import, ReportBuilder
+from .leg import JOINTS, MARKERS, MARKERS_TOPIC, ORIENTATION, QUAT, rotations, unseen
 from .timestamps import TimestampRepair
 
 FloatArray = NDArray[np.float64]
 ROWS = 8192
 """Rows of a block."""
+ANGLES_TOPIC = "/reference/optical/joint"
+"""Angles made of markers; what a file itself says of angles is ``/reference/joint``."""
 
 
 def read_text(path: Path) -> str:
@@ -166,6 +171,42 @@ def note_hidden(names: Sequence[str], pos: FloatArray, report: ReportBuilder) ->
         )
 
 
+class MarkerOptions(CommonOptions, frozen=True, kw_only=True):
+    """How reference angles are made of markers.
+
+    Attributes
+    ----------
+    angles : str
+        Definition of the reference angles.
+    landmarks : str or None
+        Which marker is which landmark.
+    side : str or None
+        Whose angles have no side in their names.
+    """
+
+    angles: Annotated[
+        Literal["isb", "source", "off"],
+        msgspec.Meta(
+            description="reference angles from the markers: isb (Cardan angles of landmarks' frames), source (long "
+            "axes in the sagittal plane), or off; docs/joints.md"
+        ),
+    ] = "isb"
+    landmarks: Annotated[
+        str | None,
+        msgspec.Meta(
+            description="which marker is which landmark, beside those known by name: "
+            "RLE:right_knee_lat,RME:right_knee_med"
+        ),
+    ] = None
+    side: Annotated[
+        Literal["left", "right"] | None,
+        msgspec.Meta(
+            description="leg that the sensors are on: its angles are called knee, not left_knee; the other leg's "
+            "keep their side"
+        ),
+    ] = None
+
+
 def marker_import(
     t_ns: NDArray[np.int64],
     lines: NDArray[np.int64],
@@ -173,16 +214,89 @@ def marker_import(
     pos: FloatArray,
     report: ReportBuilder,
     device: dict[str, str],
+    options: MarkerOptions,
     more: Sequence[tuple[ChannelSpec, pl.DataFrame]] = (),
 ) -> Import:
-    """Return the import of a capture of markers (m), and of channels ``more`` at the same times."""
+    """Return the import of a capture of markers (m), of channels ``more`` at the same times, and of its angles."""
     note_hidden(names, pos, report)
     table = marker_table(names, pos)
     spec = ChannelSpec(MARKERS_TOPIC, MARKERS, "optical", tuple(table.columns))
-    tables = [(spec.topic, table), *((s.topic, t) for s, t in more)]
+    tables = [(spec, table), *more, *angle_channels(t_ns, names, pos, report, options)]
+    blocks = blocks_of(t_ns, lines, [(s.topic, t) for s, t in tables], report)
+    turning = [s.topic for s, _ in tables if s.schema == ORIENTATION]
     return Import(
-        channels=[spec, *(s for s, _ in more)],
-        blocks=unseen(blocks_of(t_ns, lines, tables, report), report),
+        channels=[s for s, _ in tables],
+        blocks=rotations(unseen(blocks, report), turning, report),
         report=report,
         metadata={"device": {"clock": "device", "frames": "as the capture system has them", **device}},
     )
+
+
+def angle_channels(
+    t_ns: NDArray[np.int64],
+    names: Sequence[str],
+    pos: FloatArray,
+    report: ReportBuilder,
+    options: MarkerOptions,
+) -> list[tuple[ChannelSpec, pl.DataFrame]]:
+    """Return ``/reference/optical/joint`` and ``…/<segment>/orientation`` as far as the markers say them."""
+    if options.angles == "off":
+        return []
+    given = {}
+    for pair in (options.landmarks or "").replace(" ", "").split(","):
+        marker, colon, role = pair.partition(":")
+        if pair and not colon:
+            raise UsageError(
+                f"option landmarks: {pair!r} is no MARKER:LANDMARK pair, such as RLE:right_knee_lat"
+            )
+        if pair:
+            given[marker] = role
+    seen = np.where((pos == 0).all(axis=2, keepdims=True), np.nan, pos)
+    try:
+        found = from_markers(t_ns.astype(np.float64) * 1e-9, names, seen, options.angles, given)
+    except ValueError as error:
+        raise UsageError(f"option landmarks: {error}") from None
+    for doubt in found.doubts:
+        report.note("reference_doubt", doubt, subject=doubt)
+    if options.side is not None:
+        start = f"{options.side}_"
+        found = ReferenceAngles(
+            angle={name.removeprefix(start): v for name, v in found.angle.items()},
+            rot={name.removeprefix(start): v for name, v in found.rot.items()},
+            said={name.removeprefix(start): v for name, v in found.said.items()},
+        )
+    return reference_channels(found, report)
+
+
+def reference_channels(
+    found: ReferenceAngles, report: ReportBuilder
+) -> list[tuple[ChannelSpec, pl.DataFrame]]:
+    """Return the channels of reference angles and attitudes, and say by which definition they are."""
+    from scipy.spatial.transform import Rotation
+
+    channels = []
+    if found.angle:
+        table = pl.DataFrame(found.angle)
+        metadata = {"sign": "upper - lower segment", **found.said}
+        channels.append((ChannelSpec(ANGLES_TOPIC, JOINTS, "", tuple(table.columns), metadata), table))
+        for name, said in found.said.items():
+            lost = 100.0 * float(np.mean(~np.isfinite(found.angle[name])))
+            report.note(
+                "reference_angle",
+                f"{ANGLES_TOPIC} {name}: {said}; {lost:.2g} % of the frames without",
+                subject=name,
+            )
+    for segment, rot in found.rot.items():
+        quat = np.full((len(rot), 4), np.nan)
+        good = np.isfinite(rot).all(axis=(1, 2))
+        if good.any():
+            quat[good] = Rotation.from_matrix(rot[good]).as_quat(canonical=True, scalar_first=True)
+        table = pl.DataFrame({c: quat[:, k] for k, c in enumerate(QUAT)})
+        said = {"frame": "x right, y forward, z up along the segment, from landmarks (docs/joints.md)"}
+        channels.append(
+            (
+                ChannelSpec(f"/reference/optical/{segment}/orientation", ORIENTATION, "optical", QUAT, said),
+                table,
+            )
+        )
+    return channels

@@ -14,7 +14,9 @@ import polars as pl
 from ..recording import Recording
 from ..recording.errors import MarchaError, UsageError
 from .alignment import IntArray
+from .gaitcycles import JointCycles, cycles
 from .metrics import available_metrics
+from .metrics_joint import doubts
 from .references import KINDS, reference_of, references
 from .view import RunView, Truth, joined
 
@@ -86,11 +88,13 @@ class RunEvaluation(msgspec.Struct):
     time_base : str
         ``estimate`` or ``reference``: at whose stamps they were compared; empty without a reference.
     note : str
-        Why there are no metrics.
+        Why there are no metrics, or what is odd about them.
     intervals : list of IntervalEvaluation
         Per annotated interval.
     groups : list of GroupEvaluation
         Per label of the tier that was asked for.
+    cycles : list of JointCycles
+        Joint angles over the gait cycle.
     """
 
     run: str
@@ -105,6 +109,7 @@ class RunEvaluation(msgspec.Struct):
     note: str = ""
     intervals: list[IntervalEvaluation] = []
     groups: list[GroupEvaluation] = []
+    cycles: list[JointCycles] = []
 
 
 class Evaluation(msgspec.Struct):
@@ -323,6 +328,8 @@ def evaluate_run(
         done.note = "the estimator was restarted at gaps (policy reset): segments do not share an origin"
         return done
     done.metrics = _measure(view)
+    done.cycles = cycles(view)
+    done.note = "; ".join(doubts(view))
     if "loop_s" in view.lineage:
         done.metrics["run_time_s"] = float(view.lineage["loop_s"])
     done.matched, done.dropped = _matched(view)

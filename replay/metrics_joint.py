@@ -6,6 +6,7 @@ interpolated at the reference's times, never across more than 0.1 s; delay is es
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -25,6 +26,14 @@ SETTLING_S = 1.2
 GAP_NS = 100_000_000
 POINTS = 101
 JOINT_STATE = "sensor_msgs/msg/JointState"
+LEAST_EVENTS = 3
+"""Fewer events of one leg are no cycles."""
+_EVENT = re.compile(r"(heelstrike|heelcontact|footstrike|footcontact|initialcontact|hs|ic|cyclestart)")
+_SIDES = {"left": "left", "l": "left", "right": "right", "r": "right"}
+ATTITUDE_FIGURES = ("rmse_deg", "rmse_unbiased_deg", "bias_deg", "pearson_r", "delay_s")
+_FOREIGN = re.compile(
+    r"(?P<before>left_|right_|[LlRr]_?)?(?P<joint>[Hh]ip|[Kk]nee|[Aa]nkle)(_?[Aa]ngles?|_flexion)?(?P<after>_left|_right|_[lr])?"
+)
 
 
 def wrapped_deg(estimate: FloatArray, reference: FloatArray) -> FloatArray:
@@ -148,6 +157,24 @@ def starts_from_signal(t_ns: IntArray, angle: FloatArray, least_s: float = 0.6) 
     return t_ns[peaks]
 
 
+def events_of(annotations: pl.DataFrame, joint: str) -> IntArray:
+    """Return the times of annotated foot contacts that belong to a joint's leg, (n,) ns; empty without.
+
+    A joint without a side takes events without a side, else those of the only side there is.
+    """
+    found: dict[str, list[int]] = {}
+    for start, label in annotations.select("start_ns", "label").iter_rows() if annotations.height else ():
+        words = [w for w in re.split(r"[^a-z]+", (label or "").lower()) if w]
+        side = next((_SIDES[w] for w in words if w in _SIDES), "")
+        if _EVENT.fullmatch("".join(w for w in words if w not in _SIDES)):
+            found.setdefault(side, []).append(start)
+    wanted = next((side for side in ("left", "right") if joint.startswith(f"{side}_")), "")
+    chosen = found.get(wanted, [])
+    if not chosen and not wanted and len(found) == 1:
+        chosen = next(iter(found.values()))
+    return np.unique(np.array(chosen, np.int64))
+
+
 def matched(
     t_ns: IntArray, angle: FloatArray, ref_ns: IntArray, reference: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -168,14 +195,16 @@ def figures(
     angle: FloatArray,
     ref_ns: IntArray,
     reference: FloatArray,
+    starts_ns: IntArray | None = None,
     spans: IntArray | None = None,
 ) -> dict[str, float]:
     """Return all figures of one joint, names without the joint's; of stretches of time where they are given.
 
-    Cycles are those of the whole walk that lie in a stretch whole.
+    Cycles are those of the whole walk that lie in a stretch whole; ``starts_ns`` of cycles count instead of the
+    signal's.
     """
     at, value, truth = matched(t_ns, angle, ref_ns, reference)
-    starts = starts_from_signal(at, truth)
+    starts = starts_from_signal(at, truth) if starts_ns is None else starts_ns
     parts = [starts] if spans is None else [starts[inside(starts, s[None])] for s in spans]
     curves = [(cycles_of(at, value, p), cycles_of(at, truth, p)) for p in parts if at.size]
     if spans is not None:
@@ -214,15 +243,115 @@ def figures(
 def joints(view: RunView) -> dict[str, float]:
     """Errors of joint angles: RMSE, bias, correlation, range of motion, delay, limits of agreement, cycles."""
     base = view.whole or view
-    ours, truth = base.table("joint"), base.reference_table("joint")
-    if ours is None or truth is None:
+    found: dict[str, float] = {}
+    for name, own, truth, sign in _pairs(base):
+        events = events_of(base.annotations, name)
+        starts = events if len(events) >= LEAST_EVENTS else None
+        values = figures(own[0], own[1], truth[0], sign * truth[1], starts, view.spans)
+        found.update({f"{key}.{name}": value for key, value in values.items()})
+    return found
+
+
+def attitudes(view: RunView) -> dict[str, float]:
+    """Errors of segments' roll and pitch against the reference's orientation (``rmse_deg.thigh_roll``)."""
+    base = view.whole or view
+    ours = base.table("attitude")
+    if ours is None:
         return {}
     found: dict[str, float] = {}
-    for name in joint_columns(ours):
-        if name in truth.columns:
-            values = figures(*_column(ours, name), *_column(truth, name), spans=view.spans)
-            found.update({f"{key}.{name}": value for key, value in values.items()})
+    tables = base.reference_tables("orientation")
+    for topic in sorted(tables, key=len, reverse=True):  # a source's own goes before those made of markers
+        table = tables[topic]
+        segment = topic.split("/")[-2]
+        wanted = [a for a in ("roll", "pitch") if f"{segment}_{a}" in ours.columns]
+        if not wanted or table.is_empty():
+            continue
+        w, x, y, z = (table[f"quat_{a}"].to_numpy() for a in "wxyz")
+        up = np.stack(
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+        )  # of n, in the segment
+        if float(np.nanmedian(up[2])) < 0.5:
+            continue  # the capture's z is not up: its orientation says nothing of gravity
+        truth = {"roll": np.arctan2(up[1], up[2]), "pitch": np.arctan2(-up[0], np.hypot(up[1], up[2]))}
+        for angle in wanted:
+            name = f"{segment}_{angle}"
+            values = figures(*_column(ours, name), table["t_ns"].to_numpy(), truth[angle], spans=view.spans)
+            found.update({f"{key}.{name}": v for key, v in values.items() if key in ATTITUDE_FIGURES})
     return found
+
+
+def angles_beside(view: RunView) -> list[tuple[str, IntArray, FloatArray, FloatArray]]:
+    """Return joint, times, estimate and reference (rad) at them, of every joint that has a reference."""
+    found = []
+    for name, own, truth, sign in _pairs(view):
+        at, estimate, reference = matched(*own, truth[0], sign * truth[1])
+        if at.size:
+            found.append((name, at, estimate, reference))
+    return found
+
+
+def doubts(view: RunView) -> list[str]:
+    """Return what is odd between a run's joints and its reference: none of its name, or one that turns against it."""
+    ours, truth = view.table("joint"), view.reference_table("joint")
+    if ours is None or truth is None:
+        return []
+    found = []
+    for name in joint_columns(ours):
+        if reference_column(name, joint_columns(truth)) is None:
+            there = ", ".join(
+                c for c in joint_columns(truth) if _side_and_joint(c)[1] == _side_and_joint(name)[1]
+            )
+            if there:
+                found.append(f"{name}: the reference has {there}; convert it with --set side=left (or right)")
+    for name, at, estimate, reference in angles_beside(view):
+        if at.size > 100 and pearson_r(estimate, reference) < -0.5:
+            found.append(
+                f"{name}: turns against its reference (r {pearson_r(estimate, reference):.2f}): reverse the flexion "
+                "axis (-p axis=-x), or check which sensor is on which segment"
+            )
+    return found
+
+
+Series = tuple[IntArray, FloatArray]
+
+
+def _pairs(view: RunView) -> list[tuple[str, Series, Series, float]]:
+    ours, truth = view.table("joint"), view.reference_table("joint")
+    if ours is None or truth is None:
+        return []
+    found = []
+    for name in joint_columns(ours):
+        column = reference_column(name, joint_columns(truth))
+        if column is not None:
+            found.append((name, _column(ours, name), _column(truth, column[0]), column[1]))
+    return found
+
+
+def reference_column(joint: str, columns: Sequence[str]) -> tuple[str, float] | None:
+    """Return the column of a reference that speaks of a joint, and its sign against ours; None without one.
+
+    The same name counts before others' names of the same joint (Vicon's ``LKneeAngles``, OpenSim's ``hip_flexion_r``,
+    whose hip flexion and dorsiflexion are positive). Of several legs none is taken for a joint without a side.
+    """
+    if joint in columns:
+        return joint, 1.0
+    side, plain = _side_and_joint(joint)
+    found = []
+    for column in columns:
+        its_side, its = _side_and_joint(column)
+        if its == plain and (not side or not its_side or its_side == side):
+            foreign = column != its and not column.startswith(("left_", "right_"))
+            found.append((column, -1.0 if foreign and plain in ("hip", "ankle") else 1.0))
+    return found[0] if len(found) == 1 else None
+
+
+def _side_and_joint(name: str) -> tuple[str, str]:
+    """Return side (or empty) and joint of a name as ours, Vicon and OpenSim write it; others as they are."""
+    match = _FOREIGN.fullmatch(name)
+    if match is None:
+        return "", name
+    word = (match["before"] or match["after"] or "").lower().strip("_")[:1]
+    return {"l": "left", "r": "right"}.get(word, ""), match["joint"].lower()
 
 
 def joint_columns(table: pl.DataFrame) -> list[str]:

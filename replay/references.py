@@ -1,7 +1,8 @@
 """Which reference belongs to a run: decided here, for evaluation, viewer and figures alike.
 
 References lie below ``/reference/``. Of a kind (its message type), the one that is called like the run's input
-counts: ``/reference/imu2/pose`` for ``/foot/imu2``, then ``/reference/pose``, then the only one of its kind.
+counts: ``/reference/imu2/pose`` for ``/foot/imu2``, then ``/reference/pose``, then the only one of its kind. What
+the device's own filter says (``/reference/device/…``) counts only where there is nothing else.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Protocol
 from ..recording.errors import UsageError
 
 PREFIX = "/reference/"
+DEVICE = "/reference/device/"
 KINDS: dict[str, tuple[str, ...]] = {
     "pose": ("geometry_msgs/msg/PoseStamped",),
     "position": ("geometry_msgs/msg/PointStamped",),
@@ -73,6 +75,7 @@ def reference_of(
         own = [t for t in own if t.endswith(f"/{kind}")] or own
         if len(own) == 1:
             return own[0]
+    fitting = [t for t in fitting if not t.startswith(DEVICE)] or fitting
     if len(fitting) > 1:
         raise UsageError(f"{name}: several references ({', '.join(fitting)}) for {input_topic}; name one")
     return fitting[0] if fitting else None

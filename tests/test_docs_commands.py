@@ -96,6 +96,27 @@ def inside(recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     return tmp_path
 
 
+def test_walkthrough_of_joints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two sensor files and a marker file: three commands to the knee's error per cycle."""
+    from .leg_files import xsens_and_markers
+
+    xsens_and_markers(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    first, second = [b for b in blocks(ROOT / "docs" / "joints.md", "bash") if b.runs][:2]
+    three, said = commands(first.text), ""
+    assert len(three) == 3
+    for command in (*three, *commands(second.text)):
+        done = marcha(*command.words)
+        assert done.code == command.code, f"{command.words}\n{done.out}{done.err}"
+        if command is three[-1]:
+            said = done.out
+    figures = dict(line.split()[:2] for line in said.splitlines() if ".knee" in line)
+    assert float(figures["cycles.knee"]) > 10
+    assert float(figures["cycle_rmse_deg.knee"]) < 4.0  # mounted 3° off on average
+    assert float(figures["rmse_unbiased_deg.knee"]) < 1.0
+    assert (tmp_path / "cycles.png").exists()
+
+
 def test_python_of_replay(inside: Path) -> None:
     for block in blocks(ROOT / "docs" / "replay.md", "python"):
         names = run(block, {})

@@ -16,7 +16,7 @@ from .viz_walks import indoor, leg, phone
 KINDS = {
     "phone": ("signals", "steps", "heading", "fixes", "error"),
     "indoor": ("floor", "radio", "error"),
-    "leg": ("signals", "joints", "jumps", "strides"),
+    "leg": ("signals", "joints", "cycles", "jumps", "strides"),
 }
 
 

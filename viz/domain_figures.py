@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..recording import Recording
 from ..recording.errors import UsageError
+from ..replay.evaluate import evaluate
 from . import style
 from .canvas import PLACES, is_estimate
 from .curve import Curve
@@ -341,6 +342,39 @@ def jumps(rec: Recording, fig: Figure) -> None:
         _dress(ax, f"{_owner(topic)}: state, {len(edges)} changes", TIME, "")
 
 
+def cycles(rec: Recording, fig: Figure) -> None:
+    """Joint angles over the gait cycle: mean and standard deviation of estimate and reference, every cycle's error."""
+    found = [
+        (run.run, joint)
+        for run in (evaluate(rec, intervals=False).runs if any(map(is_estimate, rec.channels)) else [])
+        for joint in run.cycles
+    ]
+    if not found:
+        raise UsageError(
+            f"{rec.path}: nothing for this figure: no joint angle with a reference over two cycles"
+        )
+    percent = np.arange(101)
+    axes = _rows(fig, 2 * len(found))
+    for (run, joint), ax, below in zip(found, axes[::2], axes[1::2], strict=True):
+        color = _color(rec, f"/estimate/{run}/joint")
+        curves = (
+            (ax, joint.reference_mean, joint.reference_sd, style.REFERENCE, "reference"),
+            (ax, joint.estimate_mean, joint.estimate_sd, color, printable(run)),
+            (below, joint.error_mean, joint.error_sd, color, "estimate − reference"),
+        )
+        for panel, mean, sd, own, label in curves:
+            m, s = np.array(mean), np.array(sd)
+            panel.plot(percent, m, color=own, linewidth=1.4, label=f"{label}: mean")
+            panel.fill_between(percent, m - s, m + s, color=own, alpha=0.2, linewidth=0, label="± sd")
+        below.axhline(0.0, color=style.NORM, linewidth=0.8)
+        name = printable(joint.joint)
+        start = "annotated contacts" if joint.starts == "events" else "main maxima of the reference"
+        cycle = f"gait cycle (%), from the {start}"
+        _dress(ax, f"{name} over {joint.count} cycles", cycle, "°")
+        rmse = float(np.mean(joint.rmse))
+        _dress(below, f"{name}: error, RMSE a cycle {rmse:.2f}° (mean)", cycle, "°")
+
+
 FIGURES: dict[str, Callable[[Recording, Any], None]] = {
     "signals": signals,
     "steps": steps,
@@ -350,6 +384,7 @@ FIGURES: dict[str, Callable[[Recording, Any], None]] = {
     "radio": radio,
     "error": error,
     "joints": joints,
+    "cycles": cycles,
     "jumps": jumps,
     "strides": strides,
 }

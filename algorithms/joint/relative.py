@@ -54,7 +54,7 @@ class ChainParams(MergeParams, frozen=True, forbid_unknown_fields=True, kw_only=
             source="ours",
         ),
     ] = "mounting"
-    zero_s: Annotated[float, meta("Length of that stretch", "s", "ours", gt=0.0)] = 10.0
+    zero_s: Annotated[float, meta("Length of that stretch", "s", "ours", gt=0.0)] = 2.0
 
 
 class HingeParams(ChainParams, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -15,9 +15,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ...recording.errors import MarchaError, UsageError
-from ..contract import CommonOptions, Import, ReportBuilder
+from ..contract import Import, ReportBuilder
 from ..leg import unique_markers
-from ..optical import marker_import
+from ..optical import MarkerOptions, marker_import
 from ..units import conversion
 
 READ_S = 300.0
@@ -41,16 +41,12 @@ out.write(pos.tobytes())
 """
 
 
-class C3dOptions(CommonOptions, frozen=True, kw_only=True):
-    """Nothing of its own."""
-
-
 class C3d:
     """Importer ``c3d``: ``/reference/markers``."""
 
     name: ClassVar[str] = "c3d"
     title: ClassVar[str] = "C3D marker trajectories"
-    Options = C3dOptions
+    Options = MarkerOptions
     beside: ClassVar[bool] = True
 
     def sniff(self, head: bytes, path: Path) -> float:
@@ -60,7 +56,7 @@ class C3d:
         at = (head[0] - 1) * 512
         return 0.95 if len(head) < at + 4 or head[at + 3] in (84, 85, 86) else 0.0
 
-    def read(self, paths: Sequence[Path], options: C3dOptions) -> Import:
+    def read(self, paths: Sequence[Path], options: MarkerOptions) -> Import:
         """Read one file."""
         path = paths[0]
         head, pos = _read(path)
@@ -82,7 +78,7 @@ class C3d:
             raise MarchaError(f"{path}: its frame rate is {rate:g}; set POINT:RATE")
         t_ns = np.rint((head["first_frame"] + np.arange(len(pos))) * (1e9 / rate)).astype(np.int64)
         device = {"time": "frames at the header's rate; frame 1 is at 0", "rate_hz": f"{rate:g}"}
-        return marker_import(t_ns, np.arange(1, len(pos) + 1), names, pos * factor, report, device)
+        return marker_import(t_ns, np.arange(1, len(pos) + 1), names, pos * factor, report, device, options)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], np.ndarray]:

@@ -10,7 +10,7 @@ from typing import ClassVar
 import polars as pl
 
 from ...recording.errors import MarchaError
-from ..contract import HEAD_BYTES, ChannelSpec, CommonOptions, Import, ReportBuilder
+from ..contract import HEAD_BYTES, ChannelSpec, Import, ReportBuilder
 from ..leg import (
     IMU,
     MAG,
@@ -23,6 +23,7 @@ from ..leg import (
     rotations,
 )
 from ..mapping import CellSource, Mapping, TextLayout, Time, Topic
+from ..orientations import OrientationOptions, with_angles
 from ..text import read_blocks
 from .table import open_table
 
@@ -30,7 +31,7 @@ FIRST = "Time;Vicon Orientation;;;;IMU Acceleration;;;IMU Gyroscope;;;IMU Magnet
 SECOND = "s;W;X;Y;Z;X;Y;Z;X;Y;Z;X;Y;Z"
 
 
-class RepoImuOptions(CommonOptions, frozen=True, kw_only=True):
+class RepoImuOptions(OrientationOptions, frozen=True, kw_only=True):
     """Names of the segments, one a file.
 
     Attributes
@@ -73,9 +74,10 @@ class RepoImuCsv:
             channels += specs
             streams.append(rotations(blocks, [f"/reference/{names[key]}/orientation"], report))
         note_arbitrary(report, [f"/leg/{n}/mag" for n in names.values()], options.field_ut)
+        channels, blocks = with_angles(channels, _chained(streams), options, report)
         return Import(
             channels=channels,
-            blocks=_chained(streams),
+            blocks=blocks,
             report=report,
             metadata={
                 "device": {

@@ -14,7 +14,7 @@ from typing import ClassVar
 
 from ...recording.errors import MarchaError
 from ..columns import Header, find_header
-from ..contract import HEAD_BYTES, CommonOptions, Import, ReportBuilder
+from ..contract import HEAD_BYTES, Import, ReportBuilder
 from ..leg import (
     IMU,
     MAG,
@@ -29,6 +29,7 @@ from ..leg import (
     unseen,
 )
 from ..mapping import CellSource, Mapping, TextLayout, Time, Topic
+from ..orientations import OrientationOptions, with_angles
 from ..text import read_blocks
 from .table import open_table
 
@@ -39,7 +40,7 @@ _COLUMN = re.compile(
 )
 
 
-class SegmentsOptions(CommonOptions, frozen=True, kw_only=True):
+class SegmentsOptions(OrientationOptions, frozen=True, kw_only=True):
     """Names of the segments.
 
     Attributes
@@ -93,9 +94,12 @@ class SegmentsCsv:
         mapping = Mapping(topic=topics, time=Time(rate_hz=float(rate[1])), layout=layout)
         channels, blocks = open_table(path, mapping, path, report)
         turning = [t.name for t in topics if t.schema == ORIENTATION]
+        channels, blocks = with_angles(
+            channels, unseen(rotations(blocks, turning, report), report), options, report
+        )
         return Import(
             channels=channels,
-            blocks=unseen(rotations(blocks, turning, report), report),
+            blocks=blocks,
             report=report,
             metadata={
                 "device": {

@@ -9,14 +9,10 @@ from typing import ClassVar
 import numpy as np
 
 from ...recording.errors import MarchaError, UsageError
-from ..contract import CommonOptions, Import, ReportBuilder
+from ..contract import Import, ReportBuilder
 from ..leg import unique_markers
-from ..optical import float_rows, marker_import, read_text
+from ..optical import MarkerOptions, float_rows, marker_import, read_text
 from ..units import conversion
-
-
-class TrcOptions(CommonOptions, frozen=True, kw_only=True):
-    """Nothing of its own."""
 
 
 class Trc:
@@ -24,14 +20,14 @@ class Trc:
 
     name: ClassVar[str] = "trc"
     title: ClassVar[str] = "TRC marker trajectories (Motion Analysis, OpenSim)"
-    Options = TrcOptions
+    Options = MarkerOptions
     beside: ClassVar[bool] = True
 
     def sniff(self, head: bytes, path: Path) -> float:
         """Its first word."""
         return 1.0 if head.removeprefix(b"\xef\xbb\xbf").startswith(b"PathFileType") else 0.0
 
-    def read(self, paths: Sequence[Path], options: TrcOptions) -> Import:
+    def read(self, paths: Sequence[Path], options: MarkerOptions) -> Import:
         """Read one file."""
         path = paths[0]
         lines = read_text(path).split("\n")
@@ -69,4 +65,4 @@ class Trc:
         t_ns = np.rint(values[:, 1] * 1e9).astype(np.int64)
         pos = values[:, 2:].reshape(len(values), -1, 3) * factor
         device = {"time": "column Time (s)", "rate_hz": facts.get("DataRate", "")}
-        return marker_import(t_ns, rows, names, pos, report, device)
+        return marker_import(t_ns, rows, names, pos, report, device, options)

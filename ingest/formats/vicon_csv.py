@@ -11,16 +11,12 @@ import numpy as np
 import polars as pl
 
 from ...recording.errors import MarchaError, UsageError
-from ..contract import ChannelSpec, CommonOptions, Import, ReportBuilder
+from ..contract import ChannelSpec, Import, ReportBuilder
 from ..leg import JOINT_TOPIC, JOINTS, unique_markers
-from ..optical import FloatArray, blocks_of, float_rows, marker_import, read_text
+from ..optical import FloatArray, MarkerOptions, blocks_of, float_rows, marker_import, read_text
 from ..units import conversion
 
 SECTIONS = ("Trajectories", "Model Outputs")
-
-
-class ViconCsvOptions(CommonOptions, frozen=True, kw_only=True):
-    """Nothing of its own."""
 
 
 class _Section(NamedTuple):
@@ -36,7 +32,7 @@ class ViconCsv:
 
     name: ClassVar[str] = "vicon-csv"
     title: ClassVar[str] = "Vicon Nexus CSV: marker trajectories and modelled angles"
-    Options = ViconCsvOptions
+    Options = MarkerOptions
     beside: ClassVar[bool] = True
 
     def sniff(self, head: bytes, path: Path) -> float:
@@ -45,7 +41,7 @@ class ViconCsv:
         found = any(_starts(lines, k) for k in range(len(lines) - 3))
         return 0.95 if found else 0.0
 
-    def read(self, paths: Sequence[Path], options: ViconCsvOptions) -> Import:
+    def read(self, paths: Sequence[Path], options: MarkerOptions) -> Import:
         """Read one file."""
         path = paths[0]
         lines = read_text(path).split("\n")
@@ -92,7 +88,7 @@ class ViconCsv:
                     "unused_column", "Model Outputs are of other frames than Trajectories: not imported"
                 )
         device["rate_hz"] = f"{marks.rate_hz:g}"
-        return marker_import(_times(marks), marks.lines, names, pos, report, device, more)
+        return marker_import(_times(marks), marks.lines, names, pos, report, device, options, more)
 
 
 def _word(line: str) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 import polars as pl
 
 from ...recording.errors import MarchaError
-from ..contract import HEAD_BYTES, ChannelSpec, CommonOptions, Import, ReportBuilder
+from ..contract import HEAD_BYTES, ChannelSpec, Import, ReportBuilder
 from ..leg import (
     IMU,
     MAG,
@@ -30,6 +30,7 @@ from ..leg import (
     rotations,
 )
 from ..mapping import CellSource, Mapping, TextLayout, Time, Topic
+from ..orientations import DEVICE_TOPIC, OrientationOptions, with_angles
 from ..text import read_blocks
 from .table import open_table
 
@@ -47,7 +48,7 @@ EULER = ("Roll", "Pitch", "Yaw")
 _RATE = re.compile(r"^//\s*(?:Update Rate|Sample rate)\s*:\s*([\d.]+)\s*Hz", re.IGNORECASE)
 
 
-class XsensOptions(CommonOptions, frozen=True, kw_only=True):
+class XsensOptions(OrientationOptions, frozen=True, kw_only=True):
     """Names of the segments, one a file.
 
     Attributes
@@ -127,9 +128,11 @@ class XsensText:
                 "they are not of one session"
             )
         note_arbitrary(report, magnetic, options.field_ut)
+        joined = (item for stream in streams for item in stream)
+        channels, blocks = with_angles(channels, joined, options, report, DEVICE_TOPIC)
         return Import(
             channels=channels,
-            blocks=(item for stream in streams for item in stream),
+            blocks=blocks,
             report=report,
             metadata={
                 "device": {
