@@ -25,7 +25,9 @@ def simulate(
     output: Output,
     option: Annotated[Strings, Parameter(name="--set")] = (),
     seed: Annotated[int, Shown] = 0,
-    format: Annotated[Literal["text", "packets", "android-text", "phyphox", "sensor-logger"], Shown] = "text",
+    format: Annotated[
+        Literal["text", "packets", "android-text", "phyphox", "sensor-logger", "three-tables"], Shown
+    ] = "text",
     name: str | None = None,
     force: Force = False,
     common: Common = DEFAULT,
@@ -37,7 +39,8 @@ def simulate(
     scenario : str
         rectangle, straight, figure-eight, stairs or still; of legs: walking, sit-to-stand or squats;
         of a phone: phone-10m, phone-50m, phone-100m, phone-turns, phone-loop, phone-city, phone-floors,
-        phone-rest, phone-handled.
+        phone-rest, phone-handled; of a phone among anchors: floor-walk, floor-loop, floor-points,
+        floor-survey.
     output : Path
         Folder for the raw logs and the truth beside them.
     option : str
@@ -46,7 +49,7 @@ def simulate(
         Seed of every random number: the same seed gives the same files.
     format : str
         What the device writes: serial text or binary packets; of a phone android-text, phyphox or
-        sensor-logger.
+        sensor-logger; of a floor three-tables.
     name : str
         Middle of the file names; SCENARIO-SEED without it.
     force : bool

@@ -23,10 +23,13 @@ from .contract import (
     CommonOptions,
     Import,
     Report,
+    ReportBuilder,
     SourceAttachment,
 )
+from .floor import Floor, kind_of, read_floor
 from .legchecks import LegWatch
 from .mapping import mapping_format
+from .radio import RadioWatch, addresses
 from .truth import TruthFile, as_text, read_truth
 
 T = TypeVar("T")
@@ -101,6 +104,8 @@ def convert(
     for k, path in enumerate(sources):
         if any(path.resolve() == earlier.resolve() for earlier in sources[:k]):
             raise UsageError(f"{path}: given twice; name each input once")
+    sources, beside = _apart(sources)
+    place = {k.removeprefix("plan."): chosen.pop(k) for k in list(chosen) if k.startswith("plan.")}
     mapped = None
     if mapping is not None:
         chosen["mapping"], mapped = str(mapping), mapping_format(Path(mapping))
@@ -118,25 +123,29 @@ def convert(
             sources, format, stack, mapped=mapped, unpack_limit_gb=unpack_limit(options or {})
         )
         settings = registry.share_options(found, chosen)
+        told = ReportBuilder()
+        floor = read_floor(beside, place, told)
         truths = [read_truth(source.files[0]) for source in found]
         facts = {
             "importer": ", ".join(dict.fromkeys(r.importer.name for r, _ in found)),
             "importer_version": ", ".join(dict.fromkeys(r.source for r, _ in found)),
-            "options": chosen,
-            "given": ", ".join(as_unicode(p.name) for p in sources),
+            "options": chosen | {f"plan.{k}": v for k, v in place.items()},
+            "given": ", ".join(as_unicode(p.name) for p in (*sources, *beside)),
         }
-        read = [p for (_, files), truth in zip(found, truths, strict=True) for p in _read(files, truth)]
+        read = [
+            p for (_, files), truth in zip(found, truths, strict=True) for p in _read(files, truth)
+        ] + beside
         origin = stack.enter_context(helpers("hash", 1)).submit(provenance, read, **facts)
         try:
             with mr.create(out, overwrite=overwrite) as recording:
-                merged = _Merged(len(found))
+                merged = _Merged(len(found), floor)
                 written = _Writer(recording, progress)
                 for source, setting, truth in zip(found, settings, truths, strict=True):
                     imported = source.registered.importer.read(source.files, setting)
                     if strict:
                         imported.refuse_changes(source.files[0])
                     merged.add(source, setting, truth, imported, written)
-                report = merged.report()
+                report = merged.report(told.build())
                 for name, record in (merged.records(report) | {"provenance": origin.result()}).items():
                     recording.add_metadata(name, record)
                 for item in merged.attachments:
@@ -150,12 +159,13 @@ def convert(
 class _Merged:
     """What the sources of one recording say: their channels, reports, metadata and attachments."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, floor: Floor) -> None:
         self._several = count > 1
+        self._floor = floor
         self._reports: list[tuple[str, Report]] = []
-        self._records: dict[str, dict[str, str]] = {}
+        self._records: dict[str, dict[str, str]] = {"plan": floor.metadata} if floor.metadata else {}
         self._clocks: dict[str, str] = {}
-        self.attachments: list[SourceAttachment] = []
+        self.attachments: list[SourceAttachment] = list(floor.attachments)
         self.also_read: list[str] = []
 
     def add(
@@ -172,12 +182,14 @@ class _Merged:
         written.begin(options, name, len(self._reports))
         for spec in imported.channels:
             written.declare(spec)
-        watch = LegWatch(imported.channels)
+        watch, radio = LegWatch(imported.channels), RadioWatch(imported.channels)
         with contextlib.closing(Prefetch(imported.blocks(), "parse")) as blocks:
             for topic, table in blocks:
                 watch.feed(topic, table)
+                radio.feed(topic, table)
                 written.add(topic, table)
-        self._reports.append((name, watch.finish(imported.report)))
+        anchors = [*self._floor.anchors, *addresses(imported.attachments)]
+        self._reports.append((name, radio.finish(watch.finish(imported.report), anchors)))
         specs = [*imported.channels, *(spec for spec, _ in truth.tables)] if truth else imported.channels
         for spec, table in truth.tables if truth else ():
             written.declare(spec)
@@ -186,12 +198,13 @@ class _Merged:
         for key, record in _metadata(imported, options, truth).items():
             self._records[key if key not in self._records else f"{key}/{name}"] = record
         raw = _raw(source.files) if options.keep_source else ()
-        self.attachments += [*imported.attachments, *raw]
+        given = {a.name for a in self.attachments}  # what the user names beside a log goes before its own
+        self.attachments += [a for a in (*imported.attachments, *raw) if a.name not in given]
 
-    def report(self) -> Report:
-        """Return the report of all sources; of several a finding names its file."""
+    def report(self, floor: Report) -> Report:
+        """Return the report of all sources; of several a finding names its file. ``floor`` is that of the plan."""
         if not self._several:
-            return self._reports[0][1]
+            return _beside(self._reports[0][1], floor)
         counts = {
             key: sum(getattr(r, key) for _, r in self._reports)
             for key in ("rows_read", "rows_kept", "rows_repaired", "rows_dropped")
@@ -201,7 +214,8 @@ class _Merged:
             for name, r in self._reports
             for f in r.findings
         ]
-        return Report(**counts, findings=findings, lossy=any(r.lossy for _, r in self._reports))
+        whole = Report(**counts, findings=findings, lossy=any(r.lossy for _, r in self._reports))
+        return _beside(whole, floor)
 
     def records(self, report: Report) -> dict[str, dict[str, str]]:
         """Return all metadata records but the provenance."""
@@ -215,6 +229,26 @@ class _Merged:
             "findings": msgspec.json.encode(report.findings).decode(),
         }
         return records
+
+
+def _beside(report: Report, floor: Report) -> Report:
+    """Return the report of the sources with what was found in anchor table and plan."""
+    if not floor.findings:
+        return report
+    return msgspec.structs.replace(
+        report, findings=[*report.findings, *floor.findings], lossy=report.lossy or floor.lossy
+    )
+
+
+def _apart(sources: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Return the logs, and the anchor table and plan among what was given."""
+    beside = [p for p in sources if kind_of(p) and not registry.recognise(p)]
+    logs = [p for p in sources if p not in beside]
+    if beside and not logs:
+        raise UsageError(
+            f"{beside[0]}: an anchor table or plan goes into a recording beside a log; give the log as well"
+        )
+    return logs, beside
 
 
 class _Writer:

@@ -20,6 +20,7 @@ from .checks import SensorCheck, check_plausible
 from .contract import ChannelSpec, ReportBuilder, SourceAttachment
 from .inertial import ACC, GYR, IMU, MAG, Plateau, SourceColumn
 from .inertial import FIELD as FIELD
+from .radio import without_stale
 from .timestamps import TimestampRepair
 
 FIX = "sensor_msgs/msg/NavSatFix"
@@ -226,6 +227,8 @@ class Stream:
                 subject=self._subject,
             )
             frame = frame.sort("t", maintain_order=True)
+        if self.parts[0].schema == RADIO:
+            frame = without_stale(frame, self._subject, self._report)
         self._report.keep(frame.height)
         return frame.rename({"t": "t_ns"})
 

@@ -10,11 +10,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import polars as pl
 
 from ..recording.errors import MarchaError
-from .contract import ChannelSpec, ReportBuilder, SourceAttachment
+from .contract import ChannelSpec, Report, ReportBuilder, SourceAttachment
 
 RADIO = "marcha_msgs/msg/RadioSignal"
 POINT = "geometry_msgs/msg/PointStamped"
@@ -23,9 +24,9 @@ REFERENCE = ChannelSpec(
     "/reference/position", POINT, "plan", metadata={"frame": "the plan's x, y and height, m"}
 )
 
-STRONGEST_DBM, WEAKEST_DBM = 0.0, -120.0
-SURVEY_GAP_NS = 10_000_000_000
-"""Time between two survey points that a file gives without time."""
+WEAKEST_DBM = -120.0
+DISAGREE_DB = 3.0
+"""Mean difference above which two files of the same powers disagree: twice what averages of 50 samples leave."""
 
 
 def address(text: str) -> str:
@@ -47,6 +48,18 @@ def local_address(text: str) -> str:
     return ":".join(digits[i : i + 2] for i in range(0, 12, 2))
 
 
+def technology_of(text: str) -> str:
+    """Return ``wifi``, ``ble``, ``zigbee``, ``uwb`` or ``unknown`` of a word that people write."""
+    word = re.sub(r"[^a-z0-9]", "", text.lower())
+    patterns = {
+        "wifi": "wifi|wlan|80211",
+        "ble": "ble|bluetooth|beacon",
+        "zigbee": "zigbee|xbee",
+        "uwb": "uwb",
+    }
+    return next((name for name, pattern in patterns.items() if re.search(pattern, word)), "unknown")
+
+
 def signed_powers(values: Sequence[float], label: str, report: ReportBuilder) -> list[float]:
     """Return powers in dBm; where all of a file's are positive their sign was left out, which is repaired."""
     finite = [v for v in values if math.isfinite(v)]
@@ -58,6 +71,121 @@ def signed_powers(values: Sequence[float], label: str, report: ReportBuilder) ->
         )
         return [-v for v in values]
     return list(values)
+
+
+class RadioWatch:
+    """Looks at the transmitters of a source while it streams by: unknown ones, and phones used as hotspots.
+
+    Parameters
+    ----------
+    channels : sequence of ChannelSpec
+        Of the source.
+    """
+
+    def __init__(self, channels: Sequence[ChannelSpec]) -> None:
+        self._topics = {c.topic for c in channels if c.schema == RADIO}
+        self._heard: list[pl.DataFrame] = []
+
+    def feed(self, topic: str, table: pl.DataFrame) -> None:
+        """Count the powers of a block by transmitter."""
+        if topic in self._topics:
+            if "technology" not in table.columns:
+                table = table.with_columns(technology=pl.lit("unknown"))
+            self._heard.append(table.group_by("mac", "technology", maintain_order=True).len())
+
+    def finish(self, report: Report, anchors: Sequence[str]) -> Report:
+        """Return the report with what was found; ``anchors`` are the addresses of the anchor table."""
+        if not self._heard:
+            return report
+        heard = pl.concat(self._heard).group_by("mac", "technology", maintain_order=True).sum()
+        builder = ReportBuilder()
+        strange = heard.filter(~pl.col("mac").is_in(list(anchors)))
+        hotspots = strange.filter((pl.col("technology") == "wifi") & _is_local(pl.col("mac")))
+        if anchors and strange.height:
+            builder.note(
+                "unknown_anchor",
+                f"{strange.height} of {heard.height} transmitters are not in the anchor table, {strange['mac'][0]} "
+                "the first: kept, not used for positions; add those that are anchors to the table",
+                count=int(strange["len"].sum()),
+            )
+        if hotspots.height:
+            builder.note(
+                "hotspot",
+                f"{hotspots.height} Wi-Fi addresses are set by software, {hotspots['mac'][0]} the first: phones used "
+                "as hotspots move and are no anchors (further networks of one access point look alike)",
+                count=int(hotspots["len"].sum()),
+            )
+        found = builder.build().findings
+        order = sorted([*report.findings, *found], key=lambda f: (f.kind, f.first_line or -1))
+        return msgspec.structs.replace(report, findings=order)
+
+
+def addresses(attachments: Iterable[SourceAttachment]) -> list[str]:
+    """Return the addresses of an import's ``anchors.csv``; none where there is none."""
+    table = next((a.data for a in attachments if a.name == "anchors.csv"), b"")
+    return [row["mac"] for row in csv.DictReader(io.StringIO(table.decode()))] if table else []
+
+
+def _is_local(mac: pl.Expr) -> pl.Expr:
+    """Whether the second bit of the first octet says that an address is locally administered (IEEE 802)."""
+    return mac.str.slice(1, 1).is_in(["2", "3", "6", "7", "a", "b", "e", "f"])
+
+
+def without_stale(frame: pl.DataFrame, label: str, report: ReportBuilder) -> pl.DataFrame:
+    """Return powers without those that a scan only repeats: same transmitter, power and time last heard.
+
+    A phone hands over its list at every scan, also what it last heard before: counted again, an old power would
+    weigh as a new one.
+
+    Parameters
+    ----------
+    frame : polars.DataFrame
+        ``mac, rssi, seen`` (ns, 0 where not known) and ``line``, in order.
+    label : str
+        Which rows, said first.
+    report : ReportBuilder
+        Takes ``stale_scan``.
+    """
+    again = (frame["seen"].fill_null(0) > 0) & ~frame.select(
+        pl.struct("mac", "rssi", "seen").is_first_distinct()
+    ).to_series()
+    if again.any():
+        report.drop(
+            "stale_scan",
+            f"{label}: handed over again by a later scan (same transmitter, power and time last heard): the first "
+            "is kept",
+            count=int(again.sum()),
+            line=int(frame["line"][int(again.arg_true()[0])]),
+            subject=label,
+        )
+    return frame.filter(~again)
+
+
+def compare_powers(
+    ours: Mapping[Any, float], theirs: Mapping[Any, float], label: str, report: ReportBuilder
+) -> None:
+    """Report two files that state different powers of the same points (``files_disagree``).
+
+    Parameters
+    ----------
+    ours, theirs : mapping
+        Mean power (dBm) by point.
+    label : str
+        What is compared, in words.
+    report : ReportBuilder
+        Takes the finding.
+    """
+    both = sorted(set(ours) & set(theirs))
+    if not both:
+        return
+    difference = float(np.mean([ours[k] - theirs[k] for k in both]))
+    if abs(difference) > DISAGREE_DB:
+        report.note(
+            "files_disagree",
+            f"{label}: {abs(difference):.1f} dB {'stronger' if difference > 0 else 'weaker'} on the mean of "
+            f"{len(both)} points; kept as they are: calibrate from one of them and use it with its own kind",
+            count=len(both),
+        )
 
 
 def anchor_table(anchors: Iterable[Mapping[str, Any]]) -> SourceAttachment:

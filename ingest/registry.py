@@ -18,6 +18,7 @@ from ..recording.files import require_regular
 from .archive import UNPACK_LIMIT_GB, is_zip, unpack
 from .contract import HEAD_BYTES, CommonOptions, Importer
 from .truth import is_side_file
+from .workbook import is_workbook
 
 GROUP = "marcha.importers"
 
@@ -278,7 +279,7 @@ def _resolve(
         raise MarchaError(f"{path}: no such file or folder")
     require_regular(path)
     folders = wanted is not None and getattr(wanted.importer, "folders", False)
-    archive = path.is_file() and is_zip(path)
+    archive = path.is_file() and is_zip(path) and not is_workbook(path)
     # What a member stores uncompressed stands in the archive as it is: it must not be taken for the log itself.
     whole = [] if archive else _candidates(path, wanted)
     if not whole and wanted is not None and folders and path.is_dir():

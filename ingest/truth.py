@@ -68,12 +68,14 @@ def read_truth(path: Path) -> TruthFile | None:
     """
     facts_file = path.with_name(f"{path.stem}.truth.toml")
     parts = {"": f"{path.stem}.truth.csv", "imu2/": f"{path.stem}.truth.imu2.csv"}
+    facts = _facts(facts_file) if facts_file.is_file() and path.suffix != ".trc" else {}
+    frame = "plan" if facts.get("frame") == "plan" else "nav"
     tables = []
     files = []
     if (steps := path.with_name(f"{path.stem}.truth.steps.csv")).is_file():
         files.append(steps)
         walked = _steps(steps)  # without a row where nobody walks: the columns are said beforehand
-        tables.append((ChannelSpec("/reference/steps", STEP, "nav", tuple(walked.columns[1:])), walked))
+        tables.append((ChannelSpec("/reference/steps", STEP, frame, tuple(walked.columns[1:])), walked))
     if (places := path.with_name(f"{path.stem}.truth.fix.csv")).is_file():
         files.append(places)
         spec = ChannelSpec("/reference/fix", "sensor_msgs/msg/NavSatFix", "wgs84", FIX)
@@ -83,18 +85,18 @@ def read_truth(path: Path) -> TruthFile | None:
             files.append(file)
             table = _table(file)
             tables += [
-                (ChannelSpec(f"/reference/{part}{what}", schema, "nav"), table.select("t_ns", *columns))
+                (ChannelSpec(f"/reference/{part}{what}", schema, frame), table.select("t_ns", *columns))
                 for what, schema, columns in SCHEMAS
                 if what != "stance" or not steps.is_file()
             ]
     if (file := path.with_name(f"{path.stem}.truth.leg.csv")).is_file() and path.suffix != ".trc":
         files.append(file)
         tables += _leg(file)
-    if facts_file.is_file() and path.suffix != ".trc":  # a capture's truth comes with its inertial log
+    if facts:  # a capture's truth comes with its inertial log
         files.append(facts_file)
     if not files:
         return None
-    return TruthFile(tuple(files), _facts(facts_file) if facts_file in files else {}, tables)
+    return TruthFile(tuple(files), facts, tables)
 
 
 def _leg(file: Path) -> Iterator[tuple[ChannelSpec, pl.DataFrame]]:

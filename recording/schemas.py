@@ -98,7 +98,7 @@ class Schema(msgspec.Struct, frozen=True):
         return not any(c.kind == "text" for c in self.columns) and not self.explode
 
 
-TECHNOLOGIES = ("unknown", "wifi", "ble", "uwb", "cell")
+TECHNOLOGIES = ("unknown", "wifi", "ble", "uwb", "cell", "zigbee")
 """Names of ``TECHNOLOGY_*`` in ``marcha_msgs/msg/RadioSignal``, by value."""
 
 _NAN = float("nan")
@@ -135,7 +135,7 @@ def _pose(position: str, rotation: str, doc: str) -> tuple[ColumnGroup, ColumnGr
 
 
 _MAC = Column("mac", "-", "mac", "hardware address of the transmitter, aa:bb:cc:dd:ee:ff", "mac")
-_TECHNOLOGY = Column("technology", "-", "technology", "unknown, wifi, ble, uwb or cell", "technology")
+_TECHNOLOGY = Column("technology", "-", "technology", "unknown, wifi, ble, uwb, cell or zigbee", "technology")
 _IMU_QUAT = _quat("orientation", "rotation from the sensor frame to the navigation frame (rot_nb)")
 _ACC = _xyz("acc", "m/s²", "linear_acceleration", "specific force in the sensor frame")
 _GYR = _xyz("gyr", "rad/s", "angular_velocity", "angular rate in the sensor frame")

@@ -76,14 +76,6 @@ class BleMbd:
             raise UsageError(
                 f"{files[0]}: tracks and calibration files do not go into one recording; convert each"
             )
-        for file, part in zip(files, parts, strict=True):
-            strange = set(part["mac"].unique()) - set(devices)
-            if strange:
-                report.note(
-                    "unknown_anchor",
-                    f"{file.name}: receiver {min(strange)} is not in the .dev file",
-                    count=len(strange),
-                )
         tables: dict[str, pl.DataFrame] = {}
         if static[0]:
             stretches = [(f, p) for f, p in zip(files, parts, strict=True) if p.height]

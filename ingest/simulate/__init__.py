@@ -5,6 +5,7 @@ truth beside it; :func:`walk` gives the same walk as arrays, without files. :fun
 that is carried in one of six placements. Equal scenario, seed and options give equal bytes.
 """
 
+from .floor import FLOOR_SCENARIOS, FloorOptions, FloorWalk, floor_walk
 from .gait import Mount, Style
 from .leg import LegCapture, LegOptions, leg
 from .phone import PhoneOptions, PhoneWalk, phone_walk
@@ -20,9 +21,12 @@ from .walks import (
 from .writer import Line, Simulated, simulate
 
 __all__ = [
+    "FLOOR_SCENARIOS",
     "IDEAL",
     "PHONE_SCENARIOS",
     "SCENARIOS",
+    "FloorOptions",
+    "FloorWalk",
     "ImuErrors",
     "LegCapture",
     "LegOptions",
@@ -35,6 +39,7 @@ __all__ = [
     "Simulation",
     "Style",
     "Walk",
+    "floor_walk",
     "leg",
     "phone_walk",
     "simulate",

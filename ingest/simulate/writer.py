@@ -14,6 +14,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ...recording.errors import MarchaError, OutputExists, UsageError
+from .floor import FLOOR_SCENARIOS
 from .gait import Motion
 from .leg import SCENARIOS as LEGS
 from .leg import leg
@@ -101,7 +102,7 @@ def simulate(
     *,
     seed: int = 0,
     name: str | None = None,
-    format: Literal["text", "packets", "android-text", "phyphox", "sensor-logger"] = "text",
+    format: Literal["text", "packets", "android-text", "phyphox", "sensor-logger", "three-tables"] = "text",
     overwrite: bool = False,
     **options: Any,
 ) -> Simulated:
@@ -115,7 +116,7 @@ def simulate(
     Parameters
     ----------
     scenario : str
-        A key of :data:`SCENARIOS` or of :data:`PHONE_SCENARIOS`.
+        A key of :data:`SCENARIOS`, of :data:`PHONE_SCENARIOS` or of :data:`FLOOR_SCENARIOS`.
     out_dir : Path or str
         Folder of the files; made where it is missing.
     seed : int
@@ -123,7 +124,8 @@ def simulate(
     name : str, optional
         Middle of the file names; default ``<scenario>-<seed>``.
     format : str
-        ``text`` or ``packets``; of a phone ``android-text`` (or ``text``), ``phyphox`` or ``sensor-logger``.
+        ``text`` or ``packets``; of a phone ``android-text`` (or ``text``), ``phyphox`` or ``sensor-logger``; of a
+        floor ``three-tables`` (or ``text``).
     overwrite : bool
         Replace files that are there.
     **options
@@ -143,6 +145,18 @@ def simulate(
     """
     if scenario in LEGS:
         return _leg(scenario, Path(out_dir), seed, name, format, overwrite, options)
+    if scenario in FLOOR_SCENARIOS:
+        from .floor_files import write_floor
+
+        if format not in ("text", "three-tables"):
+            raise UsageError(
+                f"simulate {scenario}: floors are written as three-tables; leave out format={format}"
+            )
+        paths, truth, on_floor = write_floor(
+            scenario, Path(out_dir), seed=seed, name=name, overwrite=overwrite, options=options
+        )
+        phone = on_floor.phone
+        return Simulated(paths, truth, len(phone.t_ns), phone.closed, phone.length_m)
     if scenario in PHONE_SCENARIOS:
         from .phone_files import write_phone
 
