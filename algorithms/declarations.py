@@ -47,6 +47,8 @@ class Input:
         the gap policy applies. Without it every message is handed over as it is.
     stage : str
         Name of the estimator that serves this input where neither the chain nor ``--input`` names another one.
+    reference : bool
+        Whether it reads a reference (``/reference/…``) instead of a raw channel: for calibrations.
     """
 
     name: str
@@ -56,6 +58,7 @@ class Input:
     many: bool = False
     regular: bool = False
     stage: str = ""
+    reference: bool = False
 
 
 @dataclass(frozen=True)

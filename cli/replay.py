@@ -181,7 +181,7 @@ def evaluate(
     maximum: Annotated[Strings, Parameter(name="--max")] = (),
     minimum: Annotated[Strings, Parameter(name="--min")] = (),
     run: Annotated[Strings, Parameter(name="--run")] = (),
-    alignment: Annotated[Literal["none", "origin", "origin-yaw", "se2", "sim2", "se3"], Shown] = "se3",
+    alignment: Literal["none", "origin", "origin-yaw", "se2", "sim2", "se3"] | None = None,
     reference: str | None = None,
     survey: Path | None = None,
     truth: Strings = (),
@@ -202,7 +202,8 @@ def evaluate(
         Id of a run to measure; may be repeated. All without it.
     alignment : str
         How a track is laid on the reference: as it is, first position, also first heading, least squares
-        over turn about the vertical and shift, also over a scale, or over all rotations and shift.
+        over turn about the vertical and shift, also over a scale, or over all rotations and shift. Without
+        it none where both lie on one floor plan, else se3.
     reference : str
         Topic of a reference, where several would fit.
     survey : Path

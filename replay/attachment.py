@@ -12,7 +12,8 @@ The rule, in this order, for every input:
    own. A further input takes the only fitting channel that is nearest to it: of the same device (``/phone/mag``
    beside ``/phone/imu``), else of the same body (``/leg/encoder`` beside ``/leg/thigh/imu``). Two inputs that
    ask for the same never share a channel; where as many channels fit as there are such inputs, they are taken
-   in the order of the recording, and the run says so.
+   in the order of the recording, and the run says so. A calibration's input that reads a reference takes one
+   below ``/reference/`` instead.
 4. Where this does not decide, a required input is an error that lists the candidates, an optional one stays
    empty and the run says so.
 """
@@ -193,9 +194,10 @@ def _candidates(
     named = [source.channels[t] for t in chosen.topics if fits(need, source.channels[t])]
     if named or (only_named and chosen.topics):
         return named
-    fitting = [c for t, c in source.channels.items() if fits(need, c) and not t.startswith(NOT_RAW)]
+    apart = [t for t in source.channels if t.startswith("/reference/" if need.reference else NOT_RAW)]
+    fitting = [c for t, c in source.channels.items() if fits(need, c) and (t in apart) == need.reference]
     fitting = [c for c in fitting if need.name in c.topic.split("/")] or fitting
-    return fitting if need.many or not device else _nearest(fitting, device)
+    return fitting if need.many or need.reference or not device else _nearest(fitting, device)
 
 
 def _nearest(channels: list[PlannedChannel], device: str) -> list[PlannedChannel]:

@@ -420,6 +420,7 @@ class Engine:
             "params": json.dumps(plan.params),
             **{f"param.{k}": v if isinstance(v, str) else json.dumps(v) for k, v in plan.params.items()},
             "outputs": json.dumps(outputs),
+            "frame": next((plan.outputs[n].frame_id for n in ("pose", "position") if n in plan.outputs), ""),
             "latency": str(plan.latency),
             "offline": json.dumps(plan.offline),
             "rate_hz": f"{plan.rate_hz:.6g}",

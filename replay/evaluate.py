@@ -138,7 +138,7 @@ def evaluate(
     rec: Recording,
     *,
     runs: list[str] | None = None,
-    alignment: str = "se3",
+    alignment: str | None = None,
     max_gap_s: float = 0.1,
     reference: str | None = None,
     intervals: bool = True,
@@ -155,8 +155,9 @@ def evaluate(
         With estimates, as :func:`replay` writes it.
     runs : list of str, optional
         Ids; all without it.
-    alignment : {"none", "origin", "origin-yaw", "se2", "sim2", "se3"}
-        How a track is laid upon the reference; see :func:`marcha.replay.alignment.align`.
+    alignment : {"none", "origin", "origin-yaw", "se2", "sim2", "se3"}, optional
+        How a track is laid upon the reference; see :func:`marcha.replay.alignment.align`. Without it
+        :func:`usual_alignment` decides.
     max_gap_s : float
         Reference samples farther apart are not interpolated between.
     reference : str, optional
@@ -226,7 +227,7 @@ def recording_view(
     start_ns: int | None = None,
     end_ns: int | None = None,
     *,
-    alignment: str = "se3",
+    alignment: str | None = None,
     max_gap_s: float = 0.1,
     reference: str | None = None,
     truth: Mapping[str, str] | None = None,
@@ -276,7 +277,7 @@ def recording_view(
         reference_velocity=rec.table(velocity) if rec is not None and velocity is not None else None,
         recording=rec,
         chosen_reference=reference,
-        alignment=alignment,
+        alignment=alignment or usual_alignment(rec, lineage, track),
         max_gap_s=max_gap_s,
         reference_frame=rec.channels[track].frame_id if rec is not None and track is not None else "",
         survey=None if survey is None else _surveyed(survey),
@@ -292,6 +293,17 @@ def _surveyed(rec: Recording) -> pl.DataFrame:
     if len(own) != 1:
         raise UsageError(f"{rec.path}: is no survey: it has {len(own)} channels of fixes, a survey has one")
     return rec.table(own[0])
+
+
+def usual_alignment(rec: Recording | None, lineage: Mapping[str, str], track: str | None) -> str:
+    """Return how a run is laid upon its reference where the user does not say.
+
+    ``none`` where both are positions on one floor plan: there an alignment would hide the error. ``origin`` where the
+    estimate has the plan's axes and starts at an unknown place of it. Else ``se3``: the frames are not the same.
+    """
+    if rec is None or track is None or rec.channels[track].frame_id != "plan":
+        return "se3"
+    return {"plan": "none", "plan-axes": "origin"}.get(lineage.get("frame", ""), "se3")
 
 
 def _track_references(rec: Recording, input_topic: str, chosen: str | None) -> tuple[str | None, str | None]:

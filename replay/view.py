@@ -352,6 +352,25 @@ class RunView:
         return np.column_stack((t_ns[first], t_ns[last]))
 
 
+def with_stays(reference: Trajectory, max_gap_s: float) -> Trajectory:
+    """Return a reference with samples within its stays: between two equal positions nothing needs interpolation.
+
+    A surveyor who stands at a point from one time to another states just these two.
+    """
+    t, p = reference.t_ns, reference.position
+    held = np.flatnonzero((np.diff(p, axis=0) == 0).all(axis=1) & (np.diff(t) > max_gap_s * 1e9))
+    if not held.size or reference.quat_wxyz is not None:
+        return reference
+    step = round(0.5e9 * max_gap_s)
+    within = [np.arange(t[k] + step, t[k + 1], step) for k in held]
+    times = np.concatenate([t, *within])
+    places = np.concatenate(
+        [p, *(np.repeat(p[k : k + 1], len(w), axis=0) for k, w in zip(held, within, strict=True))]
+    )
+    order = np.argsort(times, kind="stable")
+    return Trajectory(times[order], places[order])
+
+
 def compare(view: RunView, alignment: str) -> Comparison | None:
     """Match a run's track with the reference and align it."""
     track, reference = view.track, view.reference_track
@@ -359,6 +378,7 @@ def compare(view: RunView, alignment: str) -> Comparison | None:
         return None
     if view.reference_frame == PLAN:
         track, reference = _flat(track), _flat(reference)
+    reference = with_stays(reference, view.max_gap_s)
     sparse = _is_sparse(reference, view.max_gap_s)
     max_gap_s = view.max_gap_s
     if sparse and _is_sparse(track, max_gap_s) and (steps := view.table("step")) is not None:

@@ -79,6 +79,12 @@ class Anchors:
         return math.log(10.0) * self.sigma_db / (10.0 * self.eta)
 
 
+def device_of(metadata: Mapping[str, Mapping[str, str]]) -> str:
+    """Return which receiver a recording is of, for its offset: the phone's model, else the logger's name."""
+    about = metadata.get("device", {})
+    return " ".join(filter(None, (about.get("brand", ""), about.get("phone", "")))) or about.get("name", "")
+
+
 def parse_anchors(data: bytes, label: str = ATTACHMENT) -> list[dict[str, Any]]:
     """Return the rows of an anchor table; AlgorithmError names the line that does not do."""
     rows = csv.DictReader(io.StringIO(data.decode("utf-8-sig", "replace")))
@@ -142,12 +148,14 @@ def anchors_of(context: Context, *, without: str = "", need_model: bool = True) 
         raise AlgorithmError(f"without: no anchor {min(unknown)!r}; there are {_names(rows)}")
     rows = [r for r in rows if r["mac"] not in out and r["name"].lower() not in out]
     remarks: list[Remark] = []
+    offset = float(values.get("offsets_db", {}).get(device_of(context.metadata), 0.0))
     for row in rows:
         mine = measured.get(row["mac"])
         row["sigma_db"], row["borrowed"] = math.nan, False
         if mine is not None:
             row |= {k: float(mine[k]) for k in ("p_d0", "eta", "sigma_db") if mine.get(k) is not None}
-    pooled = _pooled(rows, values)
+            row["p_d0"] += offset
+    pooled = _pooled(rows, values, offset)
     borrowed: dict[str, list[str]] = {}
     for row in rows:
         common = pooled.get(row["technology"]) or pooled.get("")
@@ -190,10 +198,12 @@ def anchors_of(context: Context, *, without: str = "", need_model: bool = True) 
     )
 
 
-def _pooled(rows: list[dict[str, Any]], values: Mapping[str, Any]) -> dict[str, tuple[float, float, float]]:
+def _pooled(
+    rows: list[dict[str, Any]], values: Mapping[str, Any], offset: float
+) -> dict[str, tuple[float, float, float]]:
     """Return (P_d0, η, σ) by technology: as calibrated, else the means of the table's anchors; "" of all."""
     found = {
-        str(t): (float(v["p_d0"]), float(v["eta"]), float(v.get("sigma_db", USUAL_SIGMA_DB)))
+        str(t): (float(v["p_d0"]) + offset, float(v["eta"]), float(v.get("sigma_db", USUAL_SIGMA_DB)))
         for t, v in dict(values.get("pooled", {})).items()
     }
     for technology in {r["technology"] for r in rows} - set(found):

@@ -1,8 +1,9 @@
-"""``radio``: P_d0 and η of anchors from powers at known positions."""
+"""``radio``: P_d0 and η of anchors, offsets of receivers and a radio map, from powers at known positions."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
@@ -11,10 +12,13 @@ import numpy as np
 from ..calibration import Calibration, Calibrator, Stretch
 from ..contract import AlgorithmError, FloatArray, Input
 from ..parameters import meta
-from .anchors import ATTACHMENT, parse_anchors
-from .pathloss import PathLoss, calibrate_by_distances, regress, trimmed_mean
+from .anchors import ATTACHMENT, device_of, parse_anchors
+from .pathloss import PathLoss, calibrate_by_distances, power_dbm, regress, trimmed_mean
+from .places import Place, coverage
 
 XYZ = ("pos_x", "pos_y", "pos_z")
+ROUNDS = 20
+"""Of models and receivers' offsets in turn; each settles the offsets to a tenth of what was left."""
 
 
 class RadioParams(msgspec.Struct, frozen=True, kw_only=True):
@@ -31,14 +35,40 @@ class RadioParams(msgspec.Struct, frozen=True, kw_only=True):
     drop: Annotated[
         int, meta("samples dropped at each end of a point's powers", "", "hybrid indoor positioning", ge=0)
     ] = 5
-    cell_m: Annotated[float, meta("positions nearer than this are one point", "m", "", gt=0)] = 0.1
+    cell_m: Annotated[
+        float, meta("positions nearer than this are one point; about 2 for surveys by walking", "m", "", gt=0)
+    ] = 0.1
     least_points: Annotated[int, meta("points that an anchor needs for values of its own", "", "", ge=2)] = 4
+
+
+@dataclass
+class _Point:
+    """Powers of one transmitter at one place by one receiver."""
+
+    where: list[FloatArray] = field(default_factory=list)
+    powers: list[float] = field(default_factory=list)
+
+
+Key = tuple[str, str, tuple[int, int, int]]
+"""Receiver, transmitter, cell."""
+
+
+@dataclass(frozen=True)
+class _Mean:
+    """A point's mean place, trimmed mean power (dBm) and standard deviation of its powers (dB)."""
+
+    device: str
+    where: FloatArray
+    power: float
+    sd: float
+    count: int
 
 
 class RadioCalibration(Calibrator):
     """Log-distance model by anchor and, pooled, by technology; the points become the radio map.
 
-    Powers of one anchor at one point are one trimmed mean.
+    Powers of one transmitter at one point are one trimmed mean. Receivers that took part get an offset each, of
+    mean 0. Without an anchor table there is the radio map alone.
     """
 
     name: ClassVar[str] = "radio"
@@ -47,112 +77,180 @@ class RadioCalibration(Calibrator):
     Params: ClassVar[type[msgspec.Struct]] = RadioParams
     inputs = (
         Input("radio", "marcha_msgs/msg/RadioSignal", ("mac", "rssi_dbm"), many=True),
-        Input("position", "geometry_msgs/msg/PointStamped", XYZ, optional=True),
-        Input("pose", "geometry_msgs/msg/PoseStamped", XYZ, optional=True),
+        Input("position", "geometry_msgs/msg/PointStamped", XYZ, optional=True, reference=True),
+        Input("pose", "geometry_msgs/msg/PoseStamped", XYZ, optional=True, reference=True),
     )
 
     def calibrate(self, stretches: Sequence[Stretch]) -> Calibration:
-        """Return the models.
+        """Return the models and the map.
 
         Raises
         ------
         AlgorithmError
-            No anchor table, no positions, or nothing heard at two distances.
+            No positions, or nothing heard at a known one.
         """
         anchors: dict[str, dict[str, Any]] = {}
-        samples: dict[tuple[str, int, int, int], list[float]] = {}
+        samples: dict[Key, _Point] = {}
         for stretch in stretches:
-            if ATTACHMENT not in stretch.attachments:
-                raise AlgorithmError(
-                    f"{stretch.label}: no attachment {ATTACHMENT}; convert it with the anchor table"
-                )
-            for row in parse_anchors(stretch.attachments[ATTACHMENT]):
-                anchors.setdefault(row["mac"], row)
+            if ATTACHMENT in stretch.attachments:
+                for row in parse_anchors(stretch.attachments[ATTACHMENT]):
+                    anchors.setdefault(row["mac"], row)
             self._collect(stretch, samples)
-        points: dict[str, list[tuple[FloatArray, float, float]]] = {}
-        for (mac, *cell), powers in samples.items():
-            if mac in anchors:
-                where = np.array(cell) * self.params.cell_m
-                points.setdefault(mac, []).append(
-                    (where, trimmed_mean(powers, self.params.drop), float(np.std(powers)))
-                )
+        points: dict[str, list[_Mean]] = {}
+        for (device, mac, _), point in samples.items():
+            mean = trimmed_mean(point.powers, self.params.drop)
+            where = np.mean(point.where, axis=0)
+            points.setdefault(mac, []).append(
+                _Mean(device, where, mean, float(np.std(point.powers)), len(point.powers))
+            )
         if not points:
-            raise AlgorithmError("no power of an anchor of the table was heard at a known position")
+            raise AlgorithmError(
+                "nothing was heard at a known position; do times of radio and positions meet?"
+            )
         return self._result(anchors, points)
 
-    def _collect(self, stretch: Stretch, samples: dict[tuple[str, int, int, int], list[float]]) -> None:
+    def _collect(self, stretch: Stretch, samples: dict[Key, _Point]) -> None:
         reference = [t for name in ("position", "pose") for t in stretch.tables.get(name, ())]
         if not reference:
             raise AlgorithmError(
-                f"{stretch.label}: no positions of the receiver; name them with --input position=/reference/position"
+                f"{stretch.label}: no positions of the receiver below /reference/; name them: --input position=TOPIC"
             )
+        device = device_of(stretch.metadata)
         t = reference[0]["t_ns"].to_numpy()
         xyz = reference[0].select(XYZ).to_numpy()
         for table in stretch.tables["radio"]:
             at = table["t_ns"].to_numpy()
             inside = (at >= t[0]) & (at <= t[-1])
             where = np.column_stack([np.interp(at - t[0], t - t[0], xyz[:, i]) for i in range(3)])
-            cells = np.round(np.nan_to_num(where) / self.params.cell_m).astype(int)
+            where = np.nan_to_num(where)
+            cells = np.round(where / self.params.cell_m).astype(int).tolist()
             powers = table["rssi_dbm"].to_numpy()
             for i, mac in enumerate(table["mac"].to_list()):
                 if inside[i] and np.isfinite(powers[i]) and powers[i] < 0:
-                    key = (mac, int(cells[i, 0]), int(cells[i, 1]), int(cells[i, 2]))
-                    samples.setdefault(key, []).append(float(powers[i]))
+                    x, y, z = cells[i]
+                    point = samples.setdefault((device, mac, (x, y, z)), _Point())
+                    point.where.append(where[i])
+                    point.powers.append(float(powers[i]))
 
-    def _result(
-        self, anchors: dict[str, dict[str, Any]], points: dict[str, list[tuple[FloatArray, float, float]]]
-    ) -> Calibration:
+    def _result(self, anchors: dict[str, dict[str, Any]], points: dict[str, list[_Mean]]) -> Calibration:
         remarks: list[str] = []
-        distances = {m: self._distances(anchors[m], found) for m, found in points.items()}
-        powers = {m: np.array([p for _, p, _ in found]) for m, found in points.items()}
+        known = {m: found for m, found in points.items() if m in anchors}
+        offsets = self._offsets(anchors, known)
         pooled: dict[str, dict[str, float]] = {}
-        for technology in {anchors[m]["technology"] for m in points}:
-            mine = [m for m in points if anchors[m]["technology"] == technology]
+        for technology in sorted({anchors[m]["technology"] for m in known}):
+            mine = [m for m in known if anchors[m]["technology"] == technology]
             try:
-                model = self._model(
-                    np.concatenate([distances[m] for m in mine]), np.concatenate([powers[m] for m in mine])
-                )
+                pooled[technology] = self._fit([(anchors[m], known[m]) for m in mine], offsets)[0]
             except AlgorithmError as error:
                 remarks.append(f"{technology}: {error}")
-                continue
-            pooled[technology] = self._values(model, [w for m in mine for *_, w in points[m]])
         out: list[dict[str, Any]] = []
-        for mac, found in sorted(points.items()):
+        for mac, found in sorted(known.items()):
             row = anchors[mac]
             one: dict[str, Any] = {k: row[k] for k in ("mac", "technology", "x", "y")} | {"points": []}
             if row["z"] == row["z"]:
                 one["z"] = row["z"]
             if len(found) >= self.params.least_points:
                 try:
-                    model = self._model(distances[mac], powers[mac])
-                    one |= self._values(model, [w for *_, w in found])
-                    if model.doubt:
-                        remarks.append(f"anchor {row['name'] or mac}: {model.doubt}")
+                    values, doubt = self._fit([(row, found)], offsets)
+                    one |= values
+                    if doubt:
+                        remarks.append(f"anchor {row['name'] or mac}: {doubt}")
                 except AlgorithmError as error:
                     remarks.append(f"anchor {row['name'] or mac}: {error}")
-            one["points"] = [[float(v) for v in where] + [power] for where, power, _ in found]
+            one["points"] = [[*map(float, p.where), p.power - offsets.get(p.device, 0.0)] for p in found]
             out.append(one)
         own = sum("p_d0" in a for a in out)
-        if own < len(anchors):
+        if not anchors:
+            remarks.append("no anchor table: a radio map of fingerprints only, no ranges")
+        elif own < len(anchors):
             remarks.append(
                 f"{len(anchors) - own} of {len(anchors)} anchors have pooled values of their technology"
             )
-        height = float(np.mean([where[2] for found in points.values() for where, *_ in found]))
-        values = {"anchors": out, "pooled": pooled, "height_m": height}
-        return Calibration(
-            kind=self.name, subject="anchors", values=values, remarks=remarks, usable=bool(pooled)
+        places = self._places(points, offsets)
+        area = coverage([p.where for p in places])
+        remarks.append(
+            f"radio map of {len(places)} places, {len(points)} transmitters, {area['area_m2']:.0f} m²; within it the "
+            f"nearest place is {area['median_m']:.1f} m away (median), {area['most_m']:.1f} m at most"
         )
+        height = float(np.mean([p.where[2] for found in points.values() for p in found]))
+        values = {
+            "anchors": out,
+            "pooled": pooled,
+            "height_m": height,
+            "offsets_db": offsets,
+            "places": [p.as_dict() for p in places],
+            "coverage": area,
+        }
+        return Calibration(kind=self.name, subject="", values=values, remarks=remarks, usable=True)
+
+    def _places(self, points: dict[str, list[_Mean]], offsets: dict[str, float]) -> list[Place]:
+        """Return what was heard at each place, by all transmitters."""
+        found: dict[tuple[int, ...], list[tuple[str, _Mean]]] = {}
+        for mac, means in points.items():
+            for mean in means:
+                cell = tuple(np.round(mean.where / self.params.cell_m).astype(int).tolist())
+                found.setdefault(cell, []).append((mac, mean))
+        places = []
+        for heard in found.values():
+            where = np.mean([m.where for _, m in heard], axis=0)
+            powers: dict[str, list[_Mean]] = {}
+            for mac, mean in heard:
+                powers.setdefault(mac, []).append(mean)
+            dbm = {
+                mac: float(
+                    np.average(
+                        [m.power - offsets.get(m.device, 0.0) for m in ms], weights=[m.count for m in ms]
+                    )
+                )
+                for mac, ms in powers.items()
+            }
+            places.append(Place(where, dbm, max(m.count for _, m in heard)))
+        return places
+
+    def _offsets(self, anchors: dict[str, dict[str, Any]], known: dict[str, list[_Mean]]) -> dict[str, float]:
+        """Return each receiver's offset (dB), of mean 0, where several took part: models and offsets in turn."""
+        devices = sorted({p.device for found in known.values() for p in found})
+        offsets = dict.fromkeys(devices, 0.0)
+        if len(devices) < 2:
+            return offsets
+        for _ in range(ROUNDS):
+            left: dict[str, list[float]] = {d: [] for d in devices}
+            for mac, found in known.items():
+                if len(found) < self.params.least_points:
+                    continue
+                d = self._distances(anchors[mac], found)
+                corrected = np.array([p.power - offsets[p.device] for p in found])
+                model = regress(d, corrected)
+                residual = corrected - power_dbm(d, model.p_d0_dbm, model.eta)
+                for p, r in zip(found, residual.tolist(), strict=True):
+                    left[p.device].append(r)
+            offsets = {d: offsets[d] + (float(np.mean(left[d])) if left[d] else 0.0) for d in devices}
+            middle = float(np.mean(list(offsets.values())))
+            offsets = {d: v - middle for d, v in offsets.items()}
+        return offsets
+
+    def _fit(
+        self, parts: Sequence[tuple[dict[str, Any], list[_Mean]]], offsets: dict[str, float]
+    ) -> tuple[dict[str, float], str]:
+        """Return the model's values of anchors taken together, and what is doubtful about it."""
+        d = np.concatenate([self._distances(anchor, found) for anchor, found in parts])
+        means = [p for _, found in parts for p in found]
+        powers = np.array([p.power - offsets.get(p.device, 0.0) for p in means])
+        model = self._model(d, powers)
+        within = float(np.sqrt(np.mean(np.square([p.sd for p in means]))))
+        values = {
+            "p_d0": model.p_d0_dbm,
+            "eta": model.eta,
+            "residual_db": model.residual_db,
+            "within_db": within,
+            "sigma_db": float(np.hypot(model.residual_db, within)),
+        }
+        return values, model.doubt
 
     def _model(self, d: FloatArray, p: FloatArray) -> PathLoss:
         return regress(d, p) if self.params.method == "regression" else calibrate_by_distances(d, p)
 
     @staticmethod
-    def _values(model: PathLoss, within: Sequence[float]) -> dict[str, float]:
-        sigma = float(np.hypot(model.residual_db, np.sqrt(np.mean(np.square(within)))))
-        return {"p_d0": model.p_d0_dbm, "eta": model.eta, "residual_db": model.residual_db, "sigma_db": sigma}
-
-    @staticmethod
-    def _distances(anchor: dict[str, Any], found: Sequence[tuple[FloatArray, float, float]]) -> FloatArray:
-        where = np.array([w for w, *_ in found])
-        delta = where - np.array([anchor["x"], anchor["y"], anchor["z"]])
+    def _distances(anchor: dict[str, Any], found: Sequence[_Mean]) -> FloatArray:
+        delta = np.array([p.where for p in found]) - np.array([anchor["x"], anchor["y"], anchor["z"]])
         return np.maximum(np.sqrt((np.nan_to_num(delta) ** 2).sum(axis=1)), 0.1)

@@ -29,7 +29,7 @@ class FusionParams(RangingParams, frozen=True, kw_only=True):
     ] = 1.0
     p0: Annotated[float, meta("variance of a known start", "m²", "not given in the source", ge=0)] = 1.0
     known_start: Annotated[
-        bool, meta("start at start_x, start_y; else the first fix starts the track", "")
+        bool, meta("start at start_x, start_y of the plan; else the first fix starts the track", "")
     ] = False
 
 
@@ -38,6 +38,7 @@ HybridParams = msgspec.defstruct(
     [
         (name, kind, getattr(IndoorStepParams(), name))
         for name, kind in get_type_hints(IndoorStepParams, include_extras=True).items()
+        if name not in FusionParams.__struct_fields__
     ],
     bases=(FusionParams,),
     frozen=True,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Iterable
@@ -24,7 +25,15 @@ ORIENTATION = Input(
 )
 MAG = Input("mag", "sensor_msgs/msg/MagneticField", ("mag_x", "mag_y", "mag_z"), optional=True)
 STEP_COLUMNS = ("start_ns", "end_ns", "index", "length_m", "height_m", "heading_rad")
-STEP = Output("step", "marcha_msgs/msg/Step", STEP_COLUMNS, event=True)
+STEP = Output("step", "marcha_msgs/msg/Step", STEP_COLUMNS, event=True, frame="plan")
+POSE = Output(
+    "pose",
+    "geometry_msgs/msg/PoseStamped",
+    ("pos_x", "pos_y", "pos_z", "quat_w", "quat_x", "quat_y", "quat_z"),
+    frame="plan",
+)
+FROM_START = "plan-axes"
+"""Frame of a track that has the plan's axes and its origin where it starts."""
 
 
 class IndoorStepParams(msgspec.Struct, frozen=True, kw_only=True):
@@ -50,6 +59,7 @@ class IndoorStepParams(msgspec.Struct, frozen=True, kw_only=True):
         float,
         meta("azimuth of the plan's x axis, clockwise from north; 0: as the plan states", "deg", SOURCE),
     ] = 0.0
+    known_start: Annotated[bool, meta("start at start_x, start_y of the plan", "")] = False
     start_x: Annotated[float, meta("start in the plan", "m", "")] = 0.0
     start_y: Annotated[float, meta("start in the plan", "m", "")] = 0.0
 
@@ -148,14 +158,7 @@ class IndoorPdr(PlainEstimator):
     source: ClassVar[str] = "hybrid indoor positioning, sections 3.4 and 4.5, eqs 3.22–3.26"
     Params: ClassVar[type[msgspec.Struct]] = IndoorStepParams
     inputs = (IMU, ORIENTATION, MAG)
-    outputs = (
-        Output(
-            "pose",
-            "geometry_msgs/msg/PoseStamped",
-            ("pos_x", "pos_y", "pos_z", "quat_w", "quat_x", "quat_y", "quat_z"),
-        ),
-        STEP,
-    )
+    outputs = (POSE, STEP)
 
     def start(self, context: Context) -> None:
         """Read the plan's frame."""
@@ -165,6 +168,8 @@ class IndoorPdr(PlainEstimator):
             )
         self.steps = SourceSteps(self.params, context)
         self.x, self.y = self.params.start_x, self.params.start_y
+        if not self.params.known_start:
+            self.outputs = (dataclasses.replace(POSE, frame=FROM_START), STEP)
 
     def take(self, message: Message) -> Iterable[Result]:
         """Take one message; answer at the end of a step."""

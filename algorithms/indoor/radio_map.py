@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..contract import Context, FloatArray
 from .anchors import Anchors
@@ -72,3 +73,76 @@ def map_of(context: Context, anchors: Anchors, height_m: float) -> RadioMap | No
 def _model(anchors: Anchors, k: int, where: FloatArray, up: FloatArray) -> FloatArray:
     square = ((where - anchors.plane[k]) ** 2).sum(axis=1) + np.where(np.isnan(up), 0.0, up) ** 2
     return power_dbm(np.sqrt(np.maximum(square, 0.09)), anchors.p_d0[k], anchors.eta[k])
+
+
+@dataclass(frozen=True)
+class Field:
+    """Powers over the floor by places alone, without anchors' positions.
+
+    Attributes
+    ----------
+    grid : ndarray
+        Points (m), shape (n, 2): all within reach of a surveyed place.
+    mean, sd : ndarray
+        dBm and dB, shape (transmitters, n).
+    known : ndarray of bool
+        Transmitters that enough places heard, shape (transmitters,).
+    """
+
+    grid: FloatArray
+    mean: FloatArray
+    sd: FloatArray
+    known: NDArray[np.bool_]
+
+
+def field_of(where: FloatArray, powers: FloatArray) -> Field:
+    """Return a Gaussian process for each transmitter (Ferris et al. 2006), about a level that falls with distance.
+
+    Mean: least squares of a constant and log distance to the place where it is strongest (its anchor is not known).
+    What is left has the variance of its residuals, half of it room-sized (:data:`LENGTH_M`), half within a
+    wavelength. The grid reaches half the distance between neighbouring places beyond them (at least half a metre, at
+    most :data:`MARGIN_M`), no farther: there nothing was surveyed.
+
+    Parameters
+    ----------
+    where : ndarray
+        Places (m), shape (m, 2).
+    powers : ndarray
+        dBm, NaN where not heard, shape (m, transmitters).
+    """
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(where)
+    apart = float(np.median(tree.query(where, k=2)[0][:, 1])) if len(where) > 1 else MARGIN_M
+    margin = min(max(0.5 * apart, 0.5), MARGIN_M)
+    low, high = where.min(axis=0) - margin, where.max(axis=0) + margin
+    step = max(min(CELL_M, 0.25 * apart), float(np.sqrt(np.prod(high - low) / 20_000)), 0.05)
+    axes = [np.arange(low[k], high[k] + step, step) for k in (0, 1)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    near, _ = tree.query(grid)
+    grid = grid[near <= max(margin, 0.75 * apart)]
+    count = powers.shape[1]
+    mean, sd = np.full((count, len(grid)), np.nan), np.full((count, len(grid)), np.nan)
+    known = np.isfinite(powers).sum(axis=0) >= 3
+    between = np.linalg.norm(where[:, None] - where[None], axis=2)
+    cross = np.exp(-np.linalg.norm(grid[:, None] - where[None], axis=2) / LENGTH_M)
+    for k in np.flatnonzero(known).tolist():
+        here = np.isfinite(powers[:, k])
+        p = powers[here, k]
+        top = where[here][np.argsort(-p)[: max(1, here.sum() // 10)]].mean(axis=0)
+        design = np.column_stack(
+            [np.ones(here.sum()), -10 * np.log10(1 + np.linalg.norm(where[here] - top, axis=1))]
+        )
+        (level, eta), *_ = np.linalg.lstsq(design, p, rcond=None)
+        eta = min(max(eta, 0.0), 6.0)
+        level = float(np.mean(p - eta * design[:, 1]))
+        left = p - level - eta * design[:, 1]
+        variance = max(float(np.mean(left**2)), 4.0)
+        covariance = variance * (
+            0.5 * np.exp(-between[np.ix_(here, here)] / LENGTH_M) + 0.5 * np.eye(here.sum())
+        )
+        weights = np.linalg.solve(covariance, 0.5 * variance * cross[:, here].T).T
+        mean[k] = level - eta * 10 * np.log10(1 + np.linalg.norm(grid - top, axis=1)) + weights @ left
+        spread = 0.5 * variance - np.einsum("ij,ij->i", weights, 0.5 * variance * cross[:, here])
+        sd[k] = np.sqrt(np.maximum(spread, 0.0) + 0.25 * variance)
+    return Field(grid, mean, sd, known)

@@ -14,12 +14,14 @@ from .windows import RangingParams, WindowRanges, Windows
 
 RADIO = Input("radio", "marcha_msgs/msg/RadioSignal", ("mac", "rssi_dbm"), many=True)
 RANGES = Input("ranges", "marcha_msgs/msg/Ranging", ("mac", "distance_m"), optional=True, many=True)
-POSITION = Output("position", "geometry_msgs/msg/PointStamped", ("pos_x", "pos_y", "pos_z"))
-SIGMA = Output("sigma", "marcha_msgs/msg/NavigationSigma", ("sigma_pos_x", "sigma_pos_y", "sigma_pos_z"))
+POSITION = Output("position", "geometry_msgs/msg/PointStamped", ("pos_x", "pos_y", "pos_z"), frame="plan")
+SIGMA = Output(
+    "sigma", "marcha_msgs/msg/NavigationSigma", ("sigma_pos_x", "sigma_pos_y", "sigma_pos_z"), frame="plan"
+)
 _RANGE = ("mac", "distance_m", "technology", "sd_m")
 RANGED = (
-    Output("ranges", "marcha_msgs/msg/Ranging", _RANGE),
-    Output("corrected", "marcha_msgs/msg/Ranging", _RANGE),
+    Output("ranges", "marcha_msgs/msg/Ranging", _RANGE, frame="plan"),
+    Output("corrected", "marcha_msgs/msg/Ranging", _RANGE, frame="plan"),
 )
 
 
