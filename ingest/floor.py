@@ -17,7 +17,7 @@ from typing import Any
 
 from ..recording.errors import MarchaError, UsageError
 from .contract import ReportBuilder, SourceAttachment
-from .headers import Header, header_of, numbers, read_cells
+from .headers import TableHeader, header_of, numbers, read_cells
 from .radio import anchor_table, local_address, technology_of
 from .text import start_of
 
@@ -74,7 +74,7 @@ def kind_of(path: Path) -> str:
     return "anchors" if header is not None and is_anchor_header(header) else ""
 
 
-def is_anchor_header(header: Header) -> bool:
+def is_anchor_header(header: TableHeader) -> bool:
     """Whether a header names addresses and places, and neither times nor powers of a log."""
     there = header.roles(ANCHOR_ROLES)
     logged = header.roles({"time": r"time|timestamp|t|t ns|ms|date", "sensor": r"sensor.*"})

@@ -30,7 +30,7 @@ Roles = Mapping[str, str]
 
 
 @dataclass(frozen=True)
-class Header:
+class TableHeader:
     """The first line of a table.
 
     Attributes
@@ -66,7 +66,7 @@ def plain(name: str) -> str:
     return re.sub(r"[\s_\-.:]+", " ", bare).strip()
 
 
-def header_of(head: bytes) -> Header | None:
+def header_of(head: bytes) -> TableHeader | None:
     """Return the header of a text table; None where the first line is none."""
     line = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0].strip(b"\r")
     try:
@@ -75,7 +75,7 @@ def header_of(head: bytes) -> Header | None:
         return None
     separator = max(",;\t", key=text.count)
     names = tuple(c.strip().strip('"') for c in text.split(separator))
-    return Header(separator, names) if len(names) > 1 and all(names) and not _number(names[0]) else None
+    return TableHeader(separator, names) if len(names) > 1 and all(names) and not _number(names[0]) else None
 
 
 def named_columns(text: str) -> dict[str, str]:
@@ -95,7 +95,9 @@ def named_columns(text: str) -> dict[str, str]:
     return found
 
 
-def read_cells(path: Path, places: Mapping[str, int], header: Header, report: ReportBuilder) -> pl.DataFrame:
+def read_cells(
+    path: Path, places: Mapping[str, int], header: TableHeader, report: ReportBuilder
+) -> pl.DataFrame:
     """Return the cells of a table as text by role, with ``line``; rows of another width are dropped and said.
 
     Raises
@@ -267,7 +269,7 @@ def times_ns(cells: pl.DataFrame, unit: TimeUnit, path: Path, report: ReportBuil
     return cells.with_columns(t.alias("t_ns")).filter(~lost).drop("time")
 
 
-def head_of(path: Path) -> Header | None:
+def head_of(path: Path) -> TableHeader | None:
     """Return the header of a file; None where it is no table with one."""
     return header_of(start_of(path))
 

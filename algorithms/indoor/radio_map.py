@@ -76,7 +76,7 @@ def _model(anchors: Anchors, k: int, where: FloatArray, up: FloatArray) -> Float
 
 
 @dataclass(frozen=True)
-class Field:
+class RadioField:
     """Powers over the floor by places alone, without anchors' positions.
 
     Attributes
@@ -95,7 +95,7 @@ class Field:
     known: NDArray[np.bool_]
 
 
-def field_of(where: FloatArray, powers: FloatArray) -> Field:
+def field_of(where: FloatArray, powers: FloatArray) -> RadioField:
     """Return a Gaussian process for each transmitter (Ferris et al. 2006), about a level that falls with distance.
 
     Mean: least squares of a constant and log distance to the place where it is strongest (its anchor is not known).
@@ -145,4 +145,4 @@ def field_of(where: FloatArray, powers: FloatArray) -> Field:
         mean[k] = level - eta * 10 * np.log10(1 + np.linalg.norm(grid - top, axis=1)) + weights @ left
         spread = 0.5 * variance - np.einsum("ij,ij->i", weights, 0.5 * variance * cross[:, here])
         sd[k] = np.sqrt(np.maximum(spread, 0.0) + 0.25 * variance)
-    return Field(grid, mean, sd, known)
+    return RadioField(grid, mean, sd, known)

@@ -24,7 +24,7 @@ from ..checks import SensorCheck, check_plausible
 from ..contract import ChannelSpec, CommonOptions, Import, ReportBuilder
 from ..floor import Floor, is_anchor_header, kind_of, read_floor
 from ..headers import (
-    Header,
+    TableHeader,
     TimeUnit,
     head_of,
     header_of,
@@ -115,7 +115,7 @@ class ThreeTables:
         files = [f for p in paths for f in (sorted(p.iterdir()) if p.is_dir() else [p]) if f.is_file()]
         named = named_columns(options.columns)
         report = ReportBuilder()
-        tables: dict[str, tuple[Path, Header]] = {}
+        tables: dict[str, tuple[Path, TableHeader]] = {}
         beside = [f for f in files if kind_of(f)]
         for file in files:
             if file in beside or (file.suffix in (".toml", ".md", ".txt") and head_of(file) is None):
@@ -161,7 +161,7 @@ Made = dict[str, tuple[str, dict[str, str], pl.DataFrame]]
 
 
 def _read(
-    tables: dict[str, tuple[Path, Header]],
+    tables: dict[str, tuple[Path, TableHeader]],
     named: dict[str, str],
     options: ThreeTablesOptions,
     report: ReportBuilder,
@@ -191,7 +191,7 @@ def _read(
     return made, unit.clock if unit is not None else "device"
 
 
-def _kind(header: Header | None, path: Path, named: dict[str, str] | None = None) -> str:
+def _kind(header: TableHeader | None, path: Path, named: dict[str, str] | None = None) -> str:
     """Return ``inertial``, ``radio`` or ``anchors`` of a header; empty for none of them."""
     if header is None:
         return ""
