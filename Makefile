@@ -3,13 +3,18 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 
-.PHONY: demo test lint types package bench clean
+.PHONY: demo test fuzz lint types package bench clean
 
 demo: $(VENV)/.stamp
 	$(BIN)/marcha demo -o demo --force $(if $(SHOW),--show)
 
 test: $(VENV)/.stamp-dev
 	$(BIN)/python -m pytest -n auto
+
+# Damaged inputs for all that reads; what failed is named with what reproduces it.
+N ?= 10000
+fuzz: $(VENV)/.stamp-dev
+	$(BIN)/python -m tests.fuzz $(N)
 
 lint: $(VENV)/.stamp-dev
 	$(BIN)/ruff check .

@@ -106,6 +106,8 @@ class TimestampRepair:
     def feed(self, frame: pl.DataFrame, *, final: bool = False) -> pl.DataFrame:
         """Return the rows that are settled, with ``t_ns`` (Int64, never decreasing) in the place of ``t``."""
         if frame.height:
+            frame = self._possible(frame)
+        if frame.height:
             frame = frame.with_columns(t=pl.Series(self._unwrap(frame)))
         if self._held is not None:
             frame, self._held = pl.concat([self._held, frame], rechunk=True), None
@@ -130,6 +132,22 @@ class TimestampRepair:
         self._report.keep(frame.height)
         stamp = pl.Series("t_ns", ticks * self._tick_ns, dtype=pl.Int64)
         return frame.drop("t").insert_column(0, stamp)
+
+    def _possible(self, frame: pl.DataFrame) -> pl.DataFrame:
+        """Return the rows whose time a clock can say: arithmetic on others would wrap."""
+        most = MOST_NS // self._tick_ns
+        good = frame["t"].is_between(-most, most)
+        if good.all():
+            return frame
+        at = int((~good).arg_true()[0])
+        self._report.drop(
+            "bad_row",
+            f"{self._subject}time {frame['t'][at]} is beyond any clock; row dropped",
+            count=int((~good).sum()),
+            line=frame["line"][at],
+            subject=f"{self._subject}beyond",
+        )
+        return frame.filter(good)
 
     @property
     def _jump(self) -> int:

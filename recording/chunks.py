@@ -20,8 +20,12 @@ from .codec import PREFIX, Messages
 from .errors import MarchaError
 from .files import require_regular
 
-MAX_CHUNK = 1 << 32
-"""A chunk that claims more bytes than this is broken."""
+MAX_CHUNK = 1 << 28
+"""A chunk that claims more bytes than this is broken, or made to take memory."""
+MOST_GROWTH, FREE_GROWTH = 1000, 1 << 24
+"""So many times its packed size a chunk may have where it has more than so many bytes."""
+LAST_NS = (1 << 63) - 1
+"""Times beyond this (year 2262) are none: they do not fit the integers of tables."""
 
 
 _RECORD_HEAD = struct.Struct("<BQ")
@@ -161,8 +165,8 @@ def chunk_head(record: bytes, ref: ChunkRef) -> ChunkHead:
     length = int.from_bytes(record[at : at + 8], "little")
     if at + 8 + length > len(record):
         raise ChunkError(f"{where}: its length is wrong")
-    if size > MAX_CHUNK:
-        raise ChunkError(f"{where}: claims {size} bytes")
+    if size > MAX_CHUNK or size > max(FREE_GROWTH, MOST_GROWTH * length):
+        raise ChunkError(f"{where}: claims {size} bytes in {length} packed ones")
     return ChunkHead(size, crc, compression, at + 8, length)
 
 
@@ -237,6 +241,8 @@ def split(
         end = at + 9 + length
         if end > size:
             raise ChunkError(f"a record of {length} bytes runs out of its chunk")
+        if opcode == 0:
+            raise ChunkError("a record of kind 0")
         if opcode == 5:
             if length < 22:
                 raise ChunkError(f"a message record of {length} bytes")
@@ -272,17 +278,23 @@ def _split_even(data: NDArray[np.uint8]) -> dict[int, Messages] | None:
         return None
     offsets = np.arange(n, dtype=np.int64) * stride + PREFIX.itemsize
     sizes = np.full(n, stride - PREFIX.itemsize, np.int64)
-    messages = Messages(data, offsets, sizes, head["log"].astype(np.int64), head["publish"].astype(np.int64))
+    messages = Messages(data, offsets, sizes, _times(head["log"]), _times(head["publish"]))
     channels = head["channel"]
     if one_channel:
         return {int(channels[0]): messages}
     return {int(c): messages.take(channels == c) for c in np.unique(channels)}
 
 
+def _times(stated: NDArray[np.uint64]) -> NDArray[np.int64]:
+    if len(stated) and int(stated.max()) > LAST_NS:
+        raise ChunkError(f"a message at time {int(stated.max())} ns, beyond the year 2262")
+    return stated.astype(np.int64)
+
+
 def _messages(data: NDArray[np.uint8], starts: NDArray[np.int64], sizes: NDArray[np.int64]) -> Messages:
     windows = np.lib.stride_tricks.sliding_window_view(data, PREFIX.itemsize)
     head = windows[starts].view(PREFIX)[:, 0]
-    log, publish = head["log"].astype(np.int64), head["publish"].astype(np.int64)
+    log, publish = _times(head["log"]), _times(head["publish"])
     return Messages(data, starts + PREFIX.itemsize, sizes, log, publish)
 
 

@@ -24,13 +24,16 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from .checksum import crc32
-from .chunks import BROKEN, ChunkError, ChunkRef, FileReader, read_chunk, split
+from .chunks import BROKEN, LAST_NS, ChunkError, ChunkRef, FileReader, read_chunk, split
 from .codec import PREFIX
 from .errors import Finding, MarchaError
 
 _RUN = 1 << 20
 """Bytes of loose messages (a file without chunks) that are taken together."""
 
+
+UNINDEXED = "the summary has no chunk index"
+"""Why a sound file is read from its start."""
 
 _RECORD_HEAD = struct.Struct("<BQ")
 
@@ -69,18 +72,30 @@ def find_contents(file: FileReader) -> Contents:
     if magic != MCAP0_MAGIC:
         short = f" ({file.size} bytes)" if file.size < 8 else ""
         raise MarchaError(f"{path}: not an MCAP recording{short}: it begins with {magic.hex(' ')}")
+    stated: Statistics | None = None
     try:
         contents = _summary(file)
     except BROKEN as e:
-        contents, reason = None, str(e) or type(e).__name__
+        reason = str(e) or type(e).__name__
     else:
-        reason = "the summary has no chunk index"
-    if contents is not None:
-        return contents
-    return _scan(file, reason)
+        if contents is not None and _indexes_all(contents):
+            contents.chunks.sort(key=lambda c: c.start)
+            _read_header(file, contents)
+            return contents
+        reason = UNINDEXED
+        stated = contents.statistics if contents is not None else None
+    found = _scan(file, reason)
+    count = found.statistics.message_count if found.statistics is not None else 0
+    if stated is not None and stated.message_count > count and not found.findings:
+        lost = stated.message_count - count
+        _add(
+            found.findings, "lost_messages", f"the file tells of {stated.message_count}, {lost} are not there"
+        )
+    return found
 
 
 def _summary(file: FileReader) -> Contents | None:
+    """Return what the summary says, None where there is none; ValueError where it cannot be trusted."""
     tail = file.read(max(0, file.size - 8 - _FOOTER_SIZE), _FOOTER_SIZE + 8)
     if len(tail) < _FOOTER_SIZE + 8 or tail[-8:] != MCAP0_MAGIC or tail[0] != Opcode.FOOTER:
         raise ValueError("the file ends without a footer")
@@ -117,21 +132,22 @@ def _summary(file: FileReader) -> Contents | None:
                     record.message_index_length,
                 )
             )
-    statistics = contents.statistics
-    if statistics is None or statistics.chunk_count != len(contents.chunks):
-        return None
-    if statistics.message_count and not contents.chunks:
-        return None
-    if (
-        len(contents.channels) != statistics.channel_count
-        or len(contents.metadata) != statistics.metadata_count
-    ):
-        return None
-    if len(contents.attachments) != statistics.attachment_count:
-        return None
-    contents.chunks.sort(key=lambda c: c.start)
-    _read_header(file, contents)
+    if any(c.last_ns > LAST_NS or c.start + c.length > file.size for c in contents.chunks):
+        raise ValueError("the summary tells of chunks outside the file, or of times beyond the year 2262")
     return contents
+
+
+def _indexes_all(contents: Contents) -> bool:
+    """Whether a summary leads to everything that it counts."""
+    statistics = contents.statistics
+    return (
+        statistics is not None
+        and statistics.chunk_count == len(contents.chunks)
+        and (not statistics.message_count or bool(contents.chunks))
+        and len(contents.channels) == statistics.channel_count
+        and len(contents.metadata) == statistics.metadata_count
+        and len(contents.attachments) == statistics.attachment_count
+    )
 
 
 def _read_header(file: FileReader, contents: Contents) -> None:
@@ -173,6 +189,7 @@ def _scan(file: FileReader, reason: str) -> Contents:
                 break
         except BROKEN as e:
             _add(contents.findings, "bad_record", f"byte {at}: {e or type(e).__name__}; skipped")
+            run = None
         at = end
     if not ended:
         _add(
@@ -180,7 +197,7 @@ def _scan(file: FileReader, reason: str) -> Contents:
             "truncated",
             f"{reason}: cut short at byte {at} of {file.size}; read up to the last whole chunk",
         )
-    elif reason != "the summary has no chunk index":
+    elif reason != UNINDEXED:
         _add(contents.findings, "bad_summary", f"{reason}; the file was read from its start")
     times = [t for c in contents.chunks for t in (c.first_ns, c.last_ns)]
     contents.statistics = Statistics(
@@ -233,6 +250,8 @@ def _scan_message(
 ) -> ChunkRef:
     head = np.frombuffer(file.read(at, PREFIX.itemsize), PREFIX)[0]
     channel, log = int(head["channel"]), int(head["log"])
+    if max(log, int(head["publish"])) > LAST_NS:
+        raise ValueError("a message at a time beyond the year 2262")
     if run is None or run.length + end - at > _RUN:
         run = ChunkRef(at, 0, log, log, loose=True)
         contents.chunks.append(run)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import json
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import msgspec
 import numpy as np
 import polars as pl
 from mcap import records
@@ -335,10 +335,7 @@ class Recording:
             return EventDecoder(library)
         text = source.metadata.get("columns")
         if known is not None and text is not None and "frame_id" in source.metadata:
-            try:
-                source.declared = tuple(str(c) for c in json.loads(text))
-            except ValueError:
-                source.declared = None
+            source.declared = _declared(known, text)
         return Decoder(known, library, source.declared)
 
     def _source(self, topic: str) -> TopicSource:
@@ -488,6 +485,20 @@ class Recording:
         except ChunkError as e:
             self.lost(ref, str(e))
             return {}
+
+
+def _declared(schema: Schema, text: str) -> tuple[str, ...] | None:
+    """Return the columns that a channel's metadata declare; None where they are not those of its messages."""
+    try:
+        names = msgspec.json.decode(text, type=tuple[str, ...])
+    except (msgspec.MsgspecError, RecursionError):  # anybody may write this key
+        return None
+    if schema.names:
+        fits = all(any(n.endswith(c.name) for c in schema.columns) for n in names)
+    else:
+        needed = {c.name for g in schema.groups if not g.optional for c in g.columns}
+        fits = needed <= set(names) <= {c.name for c in schema.columns}
+    return names if fits and len(set(names)) == len(names) and "t_ns" not in names else None
 
 
 def _nothing(message: bytes) -> Messages:

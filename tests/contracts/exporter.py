@@ -18,14 +18,14 @@ START_NS = 1_700_000_000_000_000_000
 ROWS = 3000
 
 
-def example(path: Path) -> Path:
+def example(path: Path, rows: int = ROWS) -> Path:
     """Write a small recording with all that an exporter must cope with; return its path.
 
     Sensors at different rates, fixes, markers, a joint, a reference, an estimate that was known later than it
     speaks of, a channel without a message, annotations, metadata and an attachment.
     """
-    t_ns = START_NS + 10_000_000 * np.arange(ROWS, dtype=np.int64)
-    wave = np.sin(np.arange(ROWS) / 7.0)
+    t_ns = START_NS + 10_000_000 * np.arange(rows, dtype=np.int64)
+    wave = np.sin(np.arange(rows) / 7.0)
     imu = pl.DataFrame(
         {"t_ns": t_ns, **{f"{s}_{a}": wave * k for s in ("acc", "gyr") for k, a in enumerate("xyz", 1)}}
     )

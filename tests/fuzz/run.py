@@ -1,0 +1,254 @@
+"""Many inputs, shared among processes; what failed, by kind and place, with what reproduces it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import re
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from .mutators import Rng
+from .seeds import Seeds
+from .server import Verdict, emptied, in_child, load, loaded, scratch
+
+WARM = 4
+"""Inputs of each target that run before all others, so that what they need is loaded once."""
+
+
+@dataclass
+class Failed:
+    """Failures of one kind at one place: the first input that shows it, and how many do."""
+
+    target: str
+    number: int
+    verdict: Verdict
+    count: int = 1
+
+
+@dataclass
+class Result:
+    """What a run found."""
+
+    inputs: int = 0
+    seconds: float = 0.0
+    cpu_s: float = 0.0
+    failed: dict[str, Failed] = field(default_factory=dict)
+    by_target: dict[str, list[float]] = field(default_factory=dict)
+
+    @property
+    def failures(self) -> int:
+        """How many inputs failed."""
+        return sum(f.count for f in self.failed.values())
+
+    def add(self, target: str, number: int, verdict: Verdict) -> None:
+        """Count one input."""
+        self.inputs += 1
+        self.cpu_s += verdict.cpu_s
+        tally = self.by_target.setdefault(target, [0, 0.0])
+        tally[0] += 1
+        tally[1] += verdict.cpu_s
+        if verdict.kind:
+            place = f"{verdict.kind} {_place(verdict.detail)}"
+            if place in self.failed:
+                self.failed[place].count += 1
+            else:
+                self.failed[place] = Failed(target, number, verdict)
+
+    def merge(self, other: Result) -> None:
+        """Add what another process found."""
+        self.inputs += other.inputs
+        self.cpu_s += other.cpu_s
+        for target, (count, used) in other.by_target.items():
+            tally = self.by_target.setdefault(target, [0, 0.0])
+            tally[0] += count
+            tally[1] += used
+        for place, found in other.failed.items():
+            if place in self.failed:
+                self.failed[place].count += found.count
+            else:
+                self.failed[place] = found
+
+
+def _place(detail: str) -> str:
+    """Return the last place of a traceback, or the detail without what differs from input to input."""
+    places = re.findall(r'File "[^"]*?([^/"]+/[^/"]+)", line (\d+)', detail)
+    last = detail.strip().splitlines()[-1] if detail.strip() else ""
+    said = re.sub(r"0x[0-9a-f]+|\d+(\.\d+)?|'[^']*'|/\S+", "…", last)[:80]
+    return f"{places[-1][0]}:{places[-1][1]} {said}" if places else said
+
+
+def generator(seed: int, target: str, number: int) -> Rng:
+    """Return the random generator of one input."""
+    return np.random.default_rng([seed, *target.encode(), number])
+
+
+def prepare(place: Path) -> Seeds:
+    """Make the sound inputs in a process of its own, and load here what that process had loaded."""
+
+    def warm() -> object:
+        from . import seeds, targets
+
+        sound = seeds.make(place / "seeds")
+        for target in {t.name: t for t in targets.targets(sound)}.values():
+            for number in range(WARM):
+                with emptied(place) as folder, contextlib.suppress(BaseException):
+                    target.run(generator(0, target.name, number), folder)
+        return sound, *loaded()
+
+    result, verdict = in_child(warm, cpu_s=600, memory=4 << 30)
+    if result is None or verdict.kind:
+        raise RuntimeError(f"the sound inputs cannot be made: {verdict.kind} {verdict.detail}")
+    sound, modules, kernels = result
+    shutil.rmtree(place / "seeds", ignore_errors=True)
+    load(modules, kernels)
+    return sound
+
+
+def run(
+    inputs: int,
+    *,
+    seed: int = 1,
+    jobs: int = 1,
+    only: str = "",
+    first: int = 0,
+    keep: Path | None = None,
+    log: Path | None = None,
+) -> Result:
+    """Run so many inputs and return what failed.
+
+    Parameters
+    ----------
+    inputs : int
+        How many, in turn over all targets.
+    seed : int
+        Another seed gives other inputs.
+    jobs : int
+        Processes that fork.
+    only : str
+        Run only targets whose name has this.
+    first : int
+        Number of the first input.
+    keep : Path, optional
+        Folder for the first input of every failure.
+    log : Path, optional
+        File that gets a line for every failure as it is found, and for every thousand inputs.
+    """
+    began = time.monotonic()
+    place = scratch()
+    try:
+        sound = prepare(place)
+        result = Result()
+        if jobs == 1:
+            result = _share(sound, place, range(first, first + inputs), seed, only, keep, log)
+        else:
+            for part in _shared(sound, place, inputs, seed, jobs, only, first, keep, log):
+                result.merge(part)
+    finally:
+        shutil.rmtree(place, ignore_errors=True)
+    result.seconds = time.monotonic() - began
+    return result
+
+
+def _shared(
+    sound: Seeds,
+    place: Path,
+    inputs: int,
+    seed: int,
+    jobs: int,
+    only: str,
+    first: int,
+    keep: Path | None,
+    log: Path | None,
+) -> list[Result]:
+    """Divide the inputs among processes that are forked from this one."""
+    import pickle
+
+    pipes = []
+    for job in range(jobs):
+        reader, writer = os.pipe()
+        if os.fork() == 0:
+            os.close(reader)
+            own = place / f"job{job}"
+            own.mkdir()
+            part = _share(sound, own, range(first + job, first + inputs, jobs), seed, only, keep, log)
+            with os.fdopen(writer, "wb") as out:
+                pickle.dump(part, out)
+            os._exit(0)
+        os.close(writer)
+        pipes.append(reader)
+    parts = []
+    for reader in pipes:
+        with os.fdopen(reader, "rb") as part:
+            parts.append(pickle.load(part))
+    for _ in pipes:
+        os.wait()
+    return parts
+
+
+def _share(
+    sound: Seeds,
+    place: Path,
+    numbers: Sequence[int],
+    seed: int,
+    only: str,
+    keep: Path | None,
+    log: Path | None,
+) -> Result:
+    from .targets import targets
+
+    chosen = [t for t in targets(sound) if only in t.name]
+    if not chosen:
+        raise SystemExit(f"no target has {only!r} in its name")
+    result = Result()
+    for number in numbers:
+        target = chosen[number % len(chosen)]
+        with emptied(place) as folder:
+            _, verdict = in_child(lambda t=target, n=number, f=folder: t.run(generator(seed, t.name, n), f))
+            known = result.failures and f"{verdict.kind} {_place(verdict.detail)}" in result.failed
+            result.add(target.name, number, verdict)
+            if verdict.kind and not known:
+                _say(
+                    log,
+                    {
+                        "target": target.name,
+                        "number": number,
+                        "seed": seed,
+                        "kind": verdict.kind,
+                        "detail": verdict.detail,
+                    },
+                )
+                if keep is not None:
+                    shutil.copytree(folder, keep / f"{seed}-{number}", dirs_exist_ok=True)
+        if log is not None and result.inputs % 1000 == 0:
+            _say(log, {"inputs": result.inputs, "failures": result.failures, "at": number})
+    return result
+
+
+def _say(log: Path | None, what: dict[str, object]) -> None:
+    if log is not None:
+        with log.open("a", encoding="utf-8") as out:
+            out.write(json.dumps(what) + "\n")
+
+
+def report(result: Result, seed: int, *, file: object = None) -> None:
+    """Print what a run found."""
+    out = sys.stdout if file is None else file
+    for place, found in sorted(result.failed.items(), key=lambda f: -f[1].count):
+        print(
+            f"\n{found.count} × {place}\n  --only {found.target!r} --seed {seed} --first {found.number}",
+            file=out,
+        )  # type: ignore[call-overload]
+        print("  " + found.verdict.detail.strip()[-1500:].replace("\n", "\n  "), file=out)  # type: ignore[call-overload]
+    print(
+        f"\n{result.inputs} inputs in {result.seconds:.0f} s ({result.cpu_s / 3600:.2f} h of processor), "
+        f"{result.failures} failures of {len(result.failed)} kinds",
+        file=out,  # type: ignore[call-overload]
+    )

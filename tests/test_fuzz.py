@@ -1,0 +1,119 @@
+"""The fuzzer sees all that is registered, notices what it must, and finds nothing in a small fixed run."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from marcha.ingest import registry
+
+from .conftest import ROOT
+from .fuzz import mcap, mutators, seeds
+from .fuzz.server import Failure, Verdict, in_child
+
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that fork")
+
+INPUTS = 150
+"""Of the fixed run: what a test may take on one core. ``make fuzz`` runs ten thousand."""
+
+
+def test_a_small_fixed_run_fails_nowhere(tmp_path: Path) -> None:
+    """In a process of its own: this one has threads, and a forked process would wait for them."""
+    log = tmp_path / "log.jsonl"
+    command = [sys.executable, "-m", "tests.fuzz", str(INPUTS), "--seed", "15", "--jobs", "1", "--times"]
+    done = subprocess.run(
+        [*command, "--log", str(log)], cwd=ROOT, capture_output=True, text=True, check=False, timeout=300
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert f"{INPUTS} inputs" in done.stdout
+    from marcha.export import available
+
+    for name in available():  # a new exporter is in without being named
+        assert f"export {name} " in done.stdout or INPUTS < 500
+
+
+def test_every_registered_importer_has_a_sample() -> None:
+    assert seeds.without_sample() == []
+    assert {c.importer.name for c in seeds.contracts()} == set(registry.importers())
+
+
+def endless() -> None:
+    while True:
+        pass
+
+
+def hungry() -> None:
+    _ = [bytearray(1 << 20) for _ in range(700)]
+    time.sleep(0)
+
+
+def crash() -> None:
+    os.abort()
+
+
+def broken() -> None:
+    raise KeyError("t")
+
+
+def refused() -> None:
+    raise Failure("value", "12 rows")
+
+
+@pytest.mark.parametrize(
+    ("task", "kind"),
+    [
+        (endless, "hang"),
+        (hungry, "memory"),
+        (crash, "crash"),
+        (broken, "traceback"),
+        (refused, "value"),
+        (dict, ""),
+    ],
+)
+def test_what_no_input_may_do_is_noticed(task: Callable[[], object], kind: str) -> None:
+    _, verdict = in_child(task, cpu_s=1, memory=300_000_000)
+    assert verdict.kind == kind
+    assert isinstance(verdict, Verdict)
+
+
+def test_the_same_number_gives_the_same_input() -> None:
+    data = b"t,x\n" + b"".join(b"%d,%d\n" % (k, k * k) for k in range(100))
+    first, second = (mutators.text(np.random.default_rng(4), data) for _ in "ab")
+    assert first == second
+
+
+def test_rows_that_a_mutation_touches_are_counted() -> None:
+    rng, data = np.random.default_rng(0), b"t,x\n" + b"".join(b"%d,%d\n" % (k, k * k) for k in range(300))
+    lines = set(data.splitlines())
+    for _ in range(300):
+        done = mutators.text(rng, data)
+        if done.rows is not None:
+            assert len(set(done.data.splitlines()) - lines) <= done.rows, done.what
+
+
+def test_records_are_taken_apart_and_put_together_again(tmp_path: Path) -> None:
+    from .contracts.exporter import example
+
+    data = example(tmp_path / "a.mcap", 50).read_bytes()
+    assert mcap.whole(mcap.records(data)) == data
+
+
+def test_a_failure_names_what_reproduces_it(tmp_path: Path) -> None:
+    from .fuzz.run import Result, report
+
+    result = Result()
+    for number in (3, 9):
+        result.add("import a", number, Verdict("traceback", 'File "/x/ingest/a.py", line 7\nKeyError: 1'))
+    with (tmp_path / "said.txt").open("w") as out:
+        report(result, 5, file=out)
+    said = (tmp_path / "said.txt").read_text()
+    assert "2 × traceback ingest/a.py:7" in said
+    assert "--only 'import a' --seed 5 --first 3" in said
+    assert json.dumps(result.failures) == "2"
