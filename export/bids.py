@@ -322,7 +322,7 @@ def _write_system(files: _Files, rec: Recording, options: BidsOptions, system: S
         "TrackingSystemName": system.name,
         "MotionChannelCount": len(rows),
         "TrackedPointsCount": len(tables),
-        "RecordingDuration": float((t_ns[-1] - t_ns[0]) / 1e9),
+        "RecordingDuration": float((t_ns[-1] - t_ns[0]) / 1e9) if len(t_ns) else 0.0,
         "MissingValues": "n/a",
         "RecordingType": "continuous",
         **{f"{k}ChannelCount": kinds.count(k) for k in _COUNTED if k in kinds},

@@ -422,6 +422,8 @@ class Recording:
         if source.declared is None and source.decoder is not None and count:
             first = self._first(source)
             columns, frame_id = ((), "") if first is None else (tuple(first[0].columns[2:]), first[1])
+        elif source.declared is None and isinstance(source.decoder, Decoder) and source.decoder.schema:
+            columns = source.decoder.schema.needed  # without a message nothing says more
         return Channel(
             source.topic,
             source.schema,
@@ -496,8 +498,7 @@ def _declared(schema: Schema, text: str) -> tuple[str, ...] | None:
     if schema.names:
         fits = all(any(n.endswith(c.name) for c in schema.columns) for n in names)
     else:
-        needed = {c.name for g in schema.groups if not g.optional for c in g.columns}
-        fits = needed <= set(names) <= {c.name for c in schema.columns}
+        fits = set(schema.needed) <= set(names) <= {c.name for c in schema.columns}
     return names if fits and len(set(names)) == len(names) and "t_ns" not in names else None
 
 

@@ -93,6 +93,11 @@ class Schema(msgspec.Struct, frozen=True):
         return tuple(c for g in self.groups for c in g.columns)
 
     @property
+    def needed(self) -> tuple[str, ...]:
+        """Columns that every table has; none in a named schema."""
+        return () if self.names else tuple(c.name for g in self.groups if not g.optional for c in g.columns)
+
+    @property
     def fixed_size(self) -> bool:
         """Whether all messages of a channel have one size, so that blocks are encoded at once."""
         return not any(c.kind == "text" for c in self.columns) and not self.explode

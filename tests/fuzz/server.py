@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import faulthandler
 import gc
 import os
 import pickle
@@ -111,6 +112,7 @@ def _collect(reader: int, limit_s: float) -> tuple[bytes, bool]:
 def _be_child(task: Callable[[], Any], writer: int, cpu_s: float, memory: int) -> None:
     """Do the task, write what became of it, and end without cleaning up: this process shares all with others."""
     os.setpgid(0, 0)
+    faulthandler.disable()  # a crash is told by its signal
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     resource.setrlimit(resource.RLIMIT_CPU, (max(1, int(cpu_s)), int(cpu_s) + 2))
     before = _resident()
