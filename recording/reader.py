@@ -11,7 +11,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import msgspec
 import numpy as np
 import polars as pl
 from mcap import records
@@ -41,7 +40,7 @@ from .definitions import load, long_name, parse_full
 from .encoder import Encoder
 from .errors import Finding, MarchaError, UsageError
 from .model import Attachment, Channel, RecordedMessage, Window
-from .schemas import SCHEMAS, Schema
+from .schemas import SCHEMAS, Schema, declared_columns
 from .windows import TIME_TYPES, OrderedPool, between, complete, cut, joined, messages_of
 from .writer import RESERVED
 
@@ -335,7 +334,7 @@ class Recording:
             return EventDecoder(library)
         text = source.metadata.get("columns")
         if known is not None and text is not None and "frame_id" in source.metadata:
-            source.declared = _declared(known, text)
+            source.declared = declared_columns(known, text)
         return Decoder(known, library, source.declared)
 
     def _source(self, topic: str) -> TopicSource:
@@ -487,19 +486,6 @@ class Recording:
         except ChunkError as e:
             self.lost(ref, str(e))
             return {}
-
-
-def _declared(schema: Schema, text: str) -> tuple[str, ...] | None:
-    """Return the columns that a channel's metadata declare; None where they are not those of its messages."""
-    try:
-        names = msgspec.json.decode(text, type=tuple[str, ...])
-    except (msgspec.MsgspecError, RecursionError):  # anybody may write this key
-        return None
-    if schema.names:
-        fits = all(any(n.endswith(c.name) for c in schema.columns) for n in names)
-    else:
-        fits = set(schema.needed) <= set(names) <= {c.name for c in schema.columns}
-    return names if fits and len(set(names)) == len(names) and "t_ns" not in names else None
 
 
 def _nothing(message: bytes) -> Messages:

@@ -103,6 +103,19 @@ class Schema(msgspec.Struct, frozen=True):
         return not any(c.kind == "text" for c in self.columns) and not self.explode
 
 
+def declared_columns(schema: Schema, text: str) -> tuple[str, ...] | None:
+    """Return the columns that a channel's metadata declare; None where they are not those of its messages."""
+    try:
+        names = msgspec.json.decode(text, type=tuple[str, ...])
+    except (msgspec.MsgspecError, RecursionError):  # anybody may write this key
+        return None
+    if schema.names:
+        fits = all(any(n.endswith(c.name) for c in schema.columns) for n in names)
+    else:
+        fits = set(schema.needed) <= set(names) <= {c.name for c in schema.columns}
+    return names if fits and len(set(names)) == len(names) and "t_ns" not in names else None
+
+
 TECHNOLOGIES = ("unknown", "wifi", "ble", "uwb", "cell", "zigbee")
 """Names of ``TECHNOLOGY_*`` in ``marcha_msgs/msg/RadioSignal``, by value."""
 
