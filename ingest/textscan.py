@@ -7,7 +7,7 @@ from typing import Any
 import numba
 import numpy as np
 
-ROW, BLANK, CHATTER, FEW, MANY, NOT_A_NUMBER, OUT_OF_RANGE = range(7)
+from .textline import CHATTER, FEW, MANY, NOT_A_NUMBER, OUT_OF_RANGE, ROW
 
 _TAB, _LF, _CR, _SPACE, _COMMA, _SEMICOLON, _COLON, _DOT, _PLUS, _MINUS = (
     9,

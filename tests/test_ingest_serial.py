@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import math
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +15,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 from marcha.ingest import Report
+from marcha.ingest.contract import ReportBuilder
 from marcha.ingest.formats.mpu6050 import Mpu6050Options
 from marcha.ingest.formats.mpu6050_packets import Mpu6050Packets
 from marcha.ingest.formats.mpu6050_serial import Mpu6050Serial
 from marcha.ingest.simulate import simulate
+from marcha.ingest.text import rows_of
 from marcha.recording import MarchaError, UsageError
 
 G = 9.80665
@@ -333,3 +337,62 @@ def test_real_recordings(data_dir: Path, conf: str) -> None:
     assert {"jitter", "gap"} & set(kinds(report))
     full = (raw[:, 1:] == 32767) | (raw[:, 1:] == -32768)
     assert sum(f.count for f in report.findings if f.kind == "clipped") == full.sum()
+
+
+PIECES = st.lists(
+    st.one_of(
+        st.lists(st.integers(-70_000, 70_000).map(str), min_size=2, max_size=4).map(",".join).map(str.encode),
+        st.tuples(
+            st.sampled_from([b"12:34:56 ", b"12:34:56.7 -> ", b"2020-01-02T12:34:56,789 > ", b""]),
+            st.sampled_from(
+                [b"1;2;3", b"1 2 3", b"1,-2\t3,", b"+1 , 2 ,3", b"1,,3", b"--1,2,3", b"1,2-3,4", b"0x1,2,3"]
+            ),
+        ).map(b"".join),
+        st.sampled_from(
+            [
+                b"",
+                b" \t",
+                b"Boot v1.2",
+                b"# 1,2",
+                b"t,a,b",
+                b"12345678901234567890123,1,2",
+                b"000000000000000000000001,2,3",
+            ]
+        ),
+        st.binary(max_size=12).map(lambda line: line.replace(b"\n", b"").replace(b"\r", b"")),
+    ),
+    min_size=1,
+    max_size=12,
+)
+
+
+@given(lines=PIECES, end=st.sampled_from([b"\n", b"\r\n", b"\r"]), final=st.booleans())
+def test_the_compiled_scanner_and_the_reader_of_lines_are_the_same(
+    lines: list[bytes], end: bytes, final: bool
+) -> None:
+    limits = [(0, 65_535), (-32_768, 32_767), (-32_768, 32_767)]
+    reports = [ReportBuilder(), ReportBuilder()]
+    piece = end.join(lines) + end * final
+    (slow, lines_slow), (fast, lines_fast) = (
+        rows_of(piece, limits, ["t", "a", "b"], report, first_line=3, compiled=compiled)
+        for report, compiled in zip(reports, (False, True), strict=True)
+    )
+    assert slow.lines.tolist() == fast.lines.tolist()
+    assert slow.values.tolist() == fast.values.tolist()
+    assert slow.wall_ms.tolist() == fast.wall_ms.tolist()
+    assert lines_slow == lines_fast
+    assert reports[0].build() == reports[1].build()
+
+
+def test_a_log_is_converted_without_a_compiler(tmp_path: Path) -> None:
+    """Loading one would take longer than everything else together."""
+    walk = simulate("still", tmp_path, seed=0).paths[0]
+    code = (
+        "import sys, marcha.cli as c\n"
+        f"try: c.main(['convert', {str(walk)!r}, '-o', {str(tmp_path / 'a.mcap')!r}, '--quiet'])\n"
+        "except SystemExit as end: assert end.code in (0, 3), end.code\n"
+        "heavy = {'numba', 'scipy', 'matplotlib', 'rerun'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
