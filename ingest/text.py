@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..recording.errors import MarchaError
 from .contract import ReportBuilder
-from .textline import BLANK, CHATTER, FEW, MANY, NOT_A_NUMBER, ROW, Line, read_line
+from .textline import BLANK, CHATTER, FEW, MANY, NOT_A_NUMBER, ROW, TextLine, read_line
 
 OddLine = tuple[int, bytes, int, int]
 """A line that is no row: its number, text, status and column at fault."""
@@ -160,7 +160,7 @@ def _line_by_line(
     lines = piece.replace(b"\r\n", b"\n").replace(b"\r", b"\n").split(b"\n")
     if not lines[-1]:
         lines.pop()
-    good: list[tuple[int, Line]] = []
+    good: list[tuple[int, TextLine]] = []
     odd: list[OddLine] = []
     for number, line in enumerate(lines, first_line):
         if not (bare := line.strip(b" \t")):

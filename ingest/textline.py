@@ -26,7 +26,7 @@ def _row(columns: int) -> re.Pattern[bytes]:
     return re.compile(_SEPARATOR.join([rb"([+-]?\d{1,17})"] * columns) + rb"[ \t]*[,;]?")
 
 
-class Line(NamedTuple):
+class TextLine(NamedTuple):
     """What a line is.
 
     Attributes
@@ -47,7 +47,7 @@ class Line(NamedTuple):
     column: int = 0
 
 
-def read_line(line: bytes, limits: Sequence[tuple[int, int]]) -> Line:
+def read_line(line: bytes, limits: Sequence[tuple[int, int]]) -> TextLine:
     """Read one line without its end, and without blanks around it.
 
     Parameters
@@ -63,28 +63,30 @@ def read_line(line: bytes, limits: Sequence[tuple[int, int]]) -> Line:
         thousandths = int((wall[4] or b"")[:3].ljust(3, b"0"))
         at, wall_ms = wall.end(), ((hours * 60 + minutes) * 60 + seconds) * 1000 + thousandths
     if at == len(line):
-        return Line(BLANK)
+        return TextLine(BLANK)
     if whole := _row(len(limits)).fullmatch(line, at):
         values = list(map(int, whole.groups()))
         if all(low <= value <= high for value, (low, high) in zip(values, limits, strict=True)):
-            return Line(ROW, values, wall_ms)
+            return TextLine(ROW, values, wall_ms)
     values, beyond = [], None
     while at < len(line):
         if len(values) == len(limits):
-            return Line(MANY)
+            return TextLine(MANY)
         number = _NUMBER.match(line, at)
         if number is None:
-            return Line(CHATTER if not values and _is_words(line[at:]) else NOT_A_NUMBER, column=len(values))
+            return TextLine(
+                CHATTER if not values and _is_words(line[at:]) else NOT_A_NUMBER, column=len(values)
+            )
         value, (low, high) = int(number[1] + number[2][:18]), limits[len(values)]
         if beyond is None and not (low <= value <= high and len(number[2]) < 18):
             beyond = len(values)
         values.append(value)
         at = number.end()
     if beyond is not None:
-        return Line(OUT_OF_RANGE, column=beyond)
+        return TextLine(OUT_OF_RANGE, column=beyond)
     if len(values) < len(limits):
-        return Line(FEW, column=len(values))
-    return Line(ROW, values, wall_ms)
+        return TextLine(FEW, column=len(values))
+    return TextLine(ROW, values, wall_ms)
 
 
 def _is_words(line: bytes) -> bool:
