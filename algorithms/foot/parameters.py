@@ -29,8 +29,11 @@ class FootParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     ] = 0.0
     detector: Annotated[
         Literal["gait", "c1c2c3", "pitch", "shoe", "are", "mv", "mag"],
-        meta("Which detector decides that the foot is still", source=DISSERTATION),
-    ] = "c1c2c3"
+        meta(
+            "Which detector decides that the foot is still",
+            source=f"gait: ours; c1c2c3, pitch: {DISSERTATION}; others: Skog et al. 2010",
+        ),
+    ] = "gait"
     window_s: Annotated[
         float,
         meta(
@@ -63,7 +66,7 @@ class FootParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             "Rest at the start: as long as there is one, between init_min_s and init_s, or exactly init_s",
             source="fixed: dissertation, section 3.6; adaptive: ours",
         ),
-    ] = "fixed"
+    ] = "adaptive"
     init_min_s: Annotated[
         float, meta("adaptive: shortest rest from which it starts", "s", "ours", gt=0.0, le=600.0)
     ] = 0.1
@@ -80,11 +83,11 @@ class FootParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     rest_acc: Annotated[
         float,
         meta("Rest at the start: greatest distance of f from its mean", "m/s²", "ours, measured", gt=0.0),
-    ] = 0.8
+    ] = 0.5
     rest_gyr: Annotated[
         float,
         meta("Rest at the start: greatest distance of ω from its mean", "rad/s", "ours, measured", gt=0.0),
-    ] = 0.3
+    ] = 0.15
     rest_bias_max: Annotated[
         float,
         meta(

@@ -6,14 +6,19 @@ mean rate is small enough to be a bias.
 
 ``fixed`` (the source): the first such stretch that lasts ``init_s``. ``adaptive`` (ours): the first that lasts
 ``init_min_s``, taken to its end or to ``init_s``; a walk that begins in motion so starts in its first stance.
-The bias is then the mean rate of the quietest half second of it, for a foot that is about to walk turns before
-it moves: taken for a bias, that turns the whole walk.
+A foot that is about to walk turns before it moves: taken for a bias, that turns the whole walk. The bias is
+therefore the mean rate of the rest's half seconds, each weighted by the inverse fourth power of its variance,
+and its variance follows from theirs and the length (:func:`bias_of`). Of a rest of less than half a second
+nothing is known but that it turns by no more than ``rest_gyr``. With a prior (``rest_bias_sigma``) the bias is
+the posterior mean: what a restless rest says of it counts little.
 """
 
 from __future__ import annotations
 
 import math
 from typing import Any
+
+import numpy as np
 
 from ..numerics.compiled import compiled, inlined
 from ..numerics.records import record_type
@@ -24,7 +29,11 @@ LONGEST_PAUSE_S = 0.5
 
 PIECE_S = 0.125
 PIECES = 4
-"""The quietest stretch of a rest is found in steps of such pieces (s), so many at a time."""
+"""Half seconds of a rest are looked at in steps of such pieces (s), so many at a time."""
+LEAST_SPREAD = 1e-4
+"""rad/s: no sensor is quieter; keeps weights finite."""
+SWAY_S = 0.25
+"""s: how long the sway of a standing foot keeps its direction, measured on walks that end in a second rest."""
 
 PIECE = record_type(
     ("elapsed", "f8"),
@@ -55,9 +64,12 @@ REST = record_type(
     ("moved_before", "i8"),  # samples before it that are not
     ("pieces", PIECE, (PIECES,)),  # the newest pieces of the rest, a ring
     ("n_pieces", "i8"),  # whole ones so far
-    ("quietest", "f8"),  # variance of the rate in the quietest stretch, rad²/s²; infinite without one
-    ("bias", "f8", (3,)),  # mean rate there
-    ("bias_count", "i8"),  # its samples
+    ("quietest", "f8"),  # variance of the rate in the quietest half second, rad²/s²; infinite without one
+    ("bias_prior", "f8"),  # variance of an axis' bias before the rest is seen, rad²/s²; 0 unknown
+    ("weights", "f8"),  # sum of the half seconds' weights
+    ("weights_squared", "f8"),  # sum of their squares
+    ("weighted", "f8", (3,)),  # weighted sum of their mean rates
+    ("bias_variance", "f8"),  # of an axis' bias after the rest, rad²/s²; 0 where it is not known
 )
 
 
@@ -91,7 +103,7 @@ def _clear(piece: Any) -> None:
 
 @compiled
 def _note(rest: Any, r: Any) -> None:
-    """Take a sample of the rest into its present piece; keep the quietest stretch."""
+    """Take a sample of the rest into its present piece; weigh the half second that a full one ends."""
     now = rest.pieces[rest.n_pieces % PIECES]
     now.elapsed += r.dt
     now.count += 1
@@ -102,32 +114,53 @@ def _note(rest: Any, r: Any) -> None:
         return
     rest.n_pieces += 1
     if rest.n_pieces >= PIECES:
-        _compare(rest)
+        _weigh(rest)
     _clear(rest.pieces[rest.n_pieces % PIECES])
 
 
 @compiled
-def _compare(rest: Any) -> None:
-    """Keep mean and variance of the newest pieces where they are the quietest so far."""
+def _weigh(rest: Any) -> None:
+    """Add the mean rate of the newest half second, by its variance, to the weighted mean."""
     n = 0
     for k in range(PIECES):
         n += rest.pieces[k].count
     variance = 0.0
     for k in range(PIECES):
         variance += rest.pieces[k].squares / n
+    mean = np.zeros(3)
     for i in range(3):
-        mean = 0.0
         for k in range(PIECES):
-            mean += rest.pieces[k].total[i] / n
-        variance -= mean * mean
-    if variance >= rest.quietest:
-        return
-    rest.quietest = variance
-    rest.bias_count = n
+            mean[i] += rest.pieces[k].total[i] / n
+        variance -= mean[i] * mean[i]
+    variance = max(variance, 0.0)
+    rest.quietest = min(rest.quietest, variance)
+    weight = 1.0 / (variance + LEAST_SPREAD * LEAST_SPREAD) ** 4
+    rest.weights += weight
+    rest.weights_squared += weight * weight
     for i in range(3):
-        rest.bias[i] = 0.0
-        for k in range(PIECES):
-            rest.bias[i] += rest.pieces[k].total[i] / n
+        rest.weighted[i] += weight * mean[i]
+
+
+@compiled
+def bias_of(rest: Any, bias: Any) -> None:
+    """Write the gyroscope's bias as the rest shows it to ``bias`` and its variance into the rest."""
+    if rest.quietest < math.inf:
+        # So many half seconds that overlap by three quarters count.
+        n = rest.weights * rest.weights / rest.weights_squared
+        length = PIECE_S * (PIECES + n - 1.0)
+        variance = (rest.quietest + LEAST_SPREAD * LEAST_SPREAD) / 3.0 * min(1.0, SWAY_S / length)
+        for i in range(3):
+            bias[i] = rest.weighted[i] / rest.weights
+    else:
+        variance = rest.gyr_max * rest.gyr_max / 3.0
+        for i in range(3):
+            bias[i] = rest.gyr[i]
+    if rest.bias_prior > 0.0:
+        trust = rest.bias_prior / (rest.bias_prior + variance)
+        variance *= trust
+        for i in range(3):
+            bias[i] *= trust
+    rest.bias_variance = variance
 
 
 @inlined
@@ -156,6 +189,10 @@ def watch(rest: Any, r: Any, k: int, time: float) -> bool:
         if rest.adaptive:
             rest.quietest = math.inf
             rest.n_pieces = 0
+            rest.weights = 0.0
+            rest.weights_squared = 0.0
+            for i in range(3):
+                rest.weighted[i] = 0.0
             _clear(rest.pieces[0])
         for i in range(3):
             rest.acc[i] = 0.0
@@ -189,9 +226,8 @@ def start(s: Any) -> None:
     x, y, z = rest.acc[0], rest.acc[1], rest.acc[2]
     gravity = math.sqrt(x * x + y * y + z * z) if rest.gravity_from_rest else rest.gravity
     level(s, rest.acc, rest.gyr, gravity)
-    if rest.adaptive and rest.quietest < math.inf:
-        for i in range(3):
-            s.bias_gyr[i] = rest.bias[i]
+    if rest.adaptive:
+        bias_of(rest, s.bias_gyr)
     if not rest.takes_bias:
         for i in range(3):
             s.bias_gyr[i] = 0.0
