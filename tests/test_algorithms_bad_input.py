@@ -31,14 +31,14 @@ def walking_only() -> np.ndarray:
 
 @pytest.mark.parametrize("name", FOOT)
 def test_never_at_rest_estimates_nothing_and_says_so(name: str) -> None:
-    result, estimator = run(name, walking_only())
+    result, estimator = run(name, walking_only(), preset="published")
     assert np.isnan(positions(result)).all()
     assert remarks(estimator)["no_rest"].fatal
 
 
 def test_no_rest_at_the_start_waits_for_the_first_one() -> None:
     rows = np.vstack([walking_only()[:500], simulated()[0]])
-    result, estimator = run("foot.9iez", rows)
+    result, estimator = run("foot.9iez", rows, preset="published")
     found = remarks(estimator)
     assert not found["no_rest"].fatal
     assert "begins at 4.99 s" in found["no_rest"].detail
@@ -46,7 +46,7 @@ def test_no_rest_at_the_start_waits_for_the_first_one() -> None:
     assert 695 <= first <= 705
     assert np.isnan(positions(result)[:first]).all()
     np.testing.assert_allclose(positions(result)[first], 0)
-    late = positions(run("foot.9iez", simulated()[0])[0])[-1]
+    late = positions(run("foot.9iez", simulated()[0], preset="published")[0])[-1]
     np.testing.assert_allclose(positions(result)[-1], late, atol=0.05)
 
 
@@ -143,7 +143,7 @@ def test_an_accelerometer_in_g_or_out_of_scale_is_stated(factor: float, fatal: b
 
 def test_a_detector_that_never_fires_is_fatal() -> None:
     rows, _ = simulated()
-    _, estimator = run("foot.9iez", rows, c1_min=9.9, c1_max=10.9, c3_max=1e-6)
+    _, estimator = run("foot.9iez", rows, detector="c1c2c3", c1_min=9.9, c1_max=10.9, c3_max=1e-6)
     assert remarks(estimator)["never_still"].fatal
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from marcha.algorithms import make
 from marcha.algorithms.foot import iez9_mad as foot_9iez_mad
 from marcha.algorithms.foot import iez15_zaru as foot_15iez_zaru
+from marcha.algorithms.foot.sample import SAMPLE
 from marcha.algorithms.numerics import kalman, rotations
 from marcha.algorithms.numerics.records import attributes, record_type
 from scipy.spatial.transform import Rotation
@@ -51,14 +52,14 @@ def compare(result: dict[str, np.ndarray], wanted: np.ndarray, first: int, toler
 
 def test_nine_states_equal_the_plain_filter() -> None:
     rows, _ = long_walk()
-    result, estimator = run("foot.9iez", rows)
+    result, estimator = run("foot.9iez", rows, preset="published")
     first = int(estimator.record.rest.index)
     compare(result, ref.filter9(rows, result["stance.still"] > 0.5, first), first, 1e-9)
 
 
 def test_fifteen_states_equal_the_plain_filter() -> None:
     rows, _ = long_walk()
-    result, estimator = run("foot.15iez-zaru", rows)
+    result, estimator = run("foot.15iez-zaru", rows, preset="published")
     p = estimator.params
     first = int(estimator.record.rest.index)
     wanted = ref.filter15(
@@ -78,8 +79,8 @@ def test_fifteen_states_equal_the_plain_filter() -> None:
 
 def test_the_zero_angular_rate_takes_part_in_that_comparison() -> None:
     rows, _ = long_walk()
-    with_rest = run("foot.15iez-zaru", rows)[0]["pose.pos_x"][-1]
-    without = run("foot.15iez-zaru", rows, zaru_after_s=1e6)[0]["pose.pos_x"][-1]
+    with_rest = run("foot.15iez-zaru", rows, preset="published")[0]["pose.pos_x"][-1]
+    without = run("foot.15iez-zaru", rows, preset="published", zaru_after_s=1e6)[0]["pose.pos_x"][-1]
     assert abs(with_rest - without) > 1e-6
 
 
@@ -127,9 +128,11 @@ def test_kernel_prediction_is_the_matrix_product(force: tuple, turn: tuple, dt: 
     cov = root @ root.T
     c = Rotation.from_rotvec(turn).as_matrix()
     f = np.array(force) * 10
-    s = make("foot.15iez-zaru").record  # type: ignore[attr-defined]
+    s = make("foot.15iez-zaru", preset="published").record  # type: ignore[attr-defined]
     s.rot[:], s.force[:], s.P[:] = c, f, cov
-    foot_15iez_zaru.predict(s, dt)
+    r = attributes(np.zeros(1, SAMPLE))[0]
+    r.dt = dt
+    foot_15iez_zaru.predict(s, r)
     got = s.P
     phi = ref.transition15(f, c, dt)
     q = [0.01**2 * dt**2] * 3 + [1e-6**2 * dt] * 3 + [0] * 3 + [0.1**2 * dt**2] * 3 + [1e-5**2 * dt] * 3

@@ -45,12 +45,12 @@ def test_equals_the_textbook_recursion() -> None:
 
     rows, _ = simulated("rectangle", seed=2)
     rows = rows[:620]
-    estimator: Any = make("foot.rts", **PARAMS)
+    estimator: Any = make("foot.rts", preset="published", **PARAMS)
     out = np.empty((len(rows), estimator.width))
     logs = np.zeros(len(rows), f.LOG)
     forward: Any = f.forward
     forward(*estimator.views(estimator.state.copy()), rows, out, logs)
-    smoothed = smooth(rows, **PARAMS)
+    smoothed = smooth(rows, preset="published", **PARAMS)
 
     first = int(np.flatnonzero(logs["stage"] == f.START)[0])
     shift, cov = np.zeros(15), logs[-1]["P"]
@@ -79,14 +79,20 @@ def test_equals_the_textbook_recursion() -> None:
 
 def test_smoothed_attitudes_are_unit_quaternions() -> None:
     rows, _ = simulated("rectangle", seed=2)
-    quat = columns(smooth(rows, **PARAMS), "pose", "quat_w", "quat_x", "quat_y", "quat_z")
+    quat = columns(smooth(rows, preset="published", **PARAMS), "pose", "quat_w", "quat_x", "quat_y", "quat_z")
     quat = quat[np.isfinite(quat[:, 0])]
     np.testing.assert_allclose(np.linalg.norm(quat, axis=1), 1.0, atol=1e-12)
 
 
 def test_is_better_than_the_filter_and_knows_how_good_it_is() -> None:
     filter_square, smooth_square, nees = [], [], []
-    params = {"sigma_gyr": 0.02, "sigma_acc": 0.2, "sigma_gyr_bias0": 2e-3, "sigma_acc_bias0": 1e-4}
+    params: dict[str, Any] = {
+        "preset": "published",
+        "sigma_gyr": 0.02,
+        "sigma_acc": 0.2,
+        "sigma_gyr_bias0": 2e-3,
+        "sigma_acc_bias0": 1e-4,
+    }
     for seed in range(12):
         rows, walk = matched_walk(seed)
         one, two = run("foot.15iez-zaru", rows, **params)[0], smooth(rows, **params)
@@ -116,7 +122,7 @@ def test_sigma_is_never_larger_than_the_filters() -> None:
 
 def test_positions_do_not_jump_when_the_foot_lands() -> None:
     rows, _ = matched_walk(3)
-    params = {"sigma_gyr": 0.02, "sigma_acc": 0.2}
+    params: dict[str, Any] = {"preset": "published", "sigma_gyr": 0.02, "sigma_acc": 0.2}
     one, two = run("foot.15iez-zaru", rows, **params)[0], smooth(rows, **params)
 
     def jump(result: dict[str, np.ndarray]) -> float:

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from marcha.algorithms import make
 from marcha.algorithms.foot import ukf as foot_ukf
+from marcha.algorithms.foot.sample import SAMPLE
+from marcha.algorithms.numerics.records import attributes
 from scipy.spatial.transform import Rotation
 
 from .algorithms_support import columns, run, simulated
@@ -21,11 +23,13 @@ def test_prediction_equals_sampling(sigma_att: float) -> None:
     dt, n = 0.5, 400_000
     sd = np.array([1.0, 0.6, 0.8, 0.1, 0.2, 0.3, 0.05, 0.04, 0.03])
     sd[:3] *= sigma_att
-    estimator: Any = make("foot.ukf", sigma_gyr=0.0, sigma_acc=0.0)
+    estimator: Any = make("foot.ukf", preset="published", sigma_gyr=0.0, sigma_acc=0.0)
     state = estimator.record
     state.P[:] = np.diag(sd**2)
     state.step_force[:] = FORCE
-    foot_ukf.predict(state, dt)
+    r = attributes(np.zeros(1, SAMPLE))[0]
+    r.dt = dt
+    foot_ukf.predict(state, r)
 
     error = rng.standard_normal((n, 9)) * sd
     true_force = Rotation.from_rotvec(-error[:, :3]).apply(FORCE)
@@ -59,8 +63,8 @@ def test_equals_the_linearized_filter_while_angles_are_small() -> None:
 
 def test_sigma_points_of_any_scaling_give_the_same_small_angle_covariance() -> None:
     rows, _ = simulated("rectangle", seed=3)
-    plain, _ = run("foot.ukf", rows[:600])
-    scaled, _ = run("foot.ukf", rows[:600], alpha=0.5, kappa=1.0)
+    plain, _ = run("foot.ukf", rows[:600], preset="published")
+    scaled, _ = run("foot.ukf", rows[:600], preset="published", alpha=0.5, kappa=1.0)
     np.testing.assert_allclose(columns(plain, "sigma"), columns(scaled, "sigma"), rtol=1e-3, atol=1e-12)
 
 

@@ -61,6 +61,9 @@ CORE: Fields = [
     ("repaired", "i8"),  # rows with a value that was not finite (held)
     ("lowest", "f8", (6,)),  # of acceleration and angular rate
     ("highest", "f8", (6,)),
+    ("unknown_bias", "f8"),  # variance of a gyroscope bias that is no error state, rad²/s²
+    ("forward", "f8", (3,)),  # sum of the steps, each turned into b where it lands: the foot's direction
+    ("lean", "f8", (2,)),  # of the horizontal position on the gyroscope's bias about the vertical, m s/rad
     ("steps", STEPS),
     ("verdict", VERDICT),
     ("rest", rest.REST),
@@ -192,7 +195,7 @@ def emit(s: Any, r: Any, out: FloatArray) -> None:
     if r.still:
         s.n_still += 1
         if not s.steps.was_still:
-            _land(s.steps, s.verdict, s.pos, out)
+            _land(s, out)
         s.steps.swing = 0.0
     s.steps.was_still = r.still
 
@@ -202,6 +205,8 @@ def _note_verdict(s: Any, r: Any) -> None:
     """Note what the sample ``r`` says of the plausibility of the run."""
     v = s.verdict
     v.navigated_s += r.dt
+    s.lean[0] -= v.navigated_s * s.vel[1] * r.dt
+    s.lean[1] += v.navigated_s * s.vel[0] * r.dt
     speed = s.vel[0] * s.vel[0] + s.vel[1] * s.vel[1] + s.vel[2] * s.vel[2]
     if speed > v.fastest * v.fastest:
         v.fastest = math.sqrt(speed)
@@ -210,8 +215,9 @@ def _note_verdict(s: Any, r: Any) -> None:
 
 
 @compiled
-def _land(steps: Any, verdict: Any, pos: Any, out: FloatArray) -> None:
+def _land(s: Any, out: FloatArray) -> None:
     """At the first still sample after a swing: write the step from the previous landing, if long enough."""
+    steps, verdict, pos = s.steps, s.verdict, s.pos
     x, y, z = pos[0] - steps.landing[0], pos[1] - steps.landing[1], pos[2] - steps.landing[2]
     verdict.n_landings += 1
     length = math.sqrt(x * x + y * y + z * z)
@@ -228,16 +234,26 @@ def _land(steps: Any, verdict: Any, pos: Any, out: FloatArray) -> None:
     steps.count += 1
     for i in range(3):
         steps.landing[i] = pos[i]
+        s.forward[i] += s.rot[0, i] * x + s.rot[1, i] * y
 
 
 @inlined
 def emit_sigma(s: Any, pos: int, vel: int, att: int, out: FloatArray) -> None:
-    """Write the standard deviations of position, velocity and attitude, by their first error states."""
+    """Write the standard deviations of position, velocity and attitude, by their first error states.
+
+    ``s.unknown_bias`` is the variance of a gyroscope bias that is no error state: what it does to heading and
+    horizontal position is added (a considered state, its effect on the tilt is taken out by every stance).
+    """
     for i in range(3):
         if s.started:
-            out[SIGMA + i] = math.sqrt(max(0.0, s.P[pos + i, pos + i]))
+            position, attitude = s.P[pos + i, pos + i], s.P[att + i, att + i]
+            if i < 2:
+                position += s.unknown_bias * s.lean[i] * s.lean[i]
+            else:
+                attitude += s.unknown_bias * s.verdict.navigated_s * s.verdict.navigated_s
+            out[SIGMA + i] = math.sqrt(max(0.0, position))
             out[SIGMA + 3 + i] = math.sqrt(max(0.0, s.P[vel + i, vel + i]))
-            out[SIGMA + 6 + i] = math.sqrt(max(0.0, s.P[att + i, att + i]))
+            out[SIGMA + 6 + i] = math.sqrt(max(0.0, attitude))
         else:
             out[SIGMA + i] = math.nan
             out[SIGMA + 3 + i] = math.nan

@@ -25,6 +25,7 @@ PUBLISHED: dict[str, Any] = {
     "init": "fixed",
     "rest_acc": 0.8,
     "rest_gyr": 0.3,
+    "rest_bias_sigma": 0.0,
 }
 """The source's detector and its rest of a fixed length."""
 ADAPTIVE: dict[str, Any] = {"detector": "gait", "init": "adaptive", "rest_acc": 0.5, "rest_gyr": 0.15}
@@ -76,10 +77,10 @@ class FootEstimator(RowKernel):
         "published": PUBLISHED,
         "short-rest": PUBLISHED | {"init_s": 0.3},
         "live": PUBLISHED | {"window_side": "trailing", "cleaning": "median"},
-        "shoe-tuned": {"detector": "shoe", "shoe_max": 1e5},
-        "are-tuned": {"detector": "are", "are_max": 0.3},
-        "mv-tuned": {"detector": "mv", "mv_max": 0.3, "window_s": 0.15},
-        "mag-tuned": {"detector": "mag", "mag_max": 0.4, "window_s": 0.15},
+        "shoe-tuned": PUBLISHED | {"detector": "shoe", "shoe_max": 1e5},
+        "are-tuned": PUBLISHED | {"detector": "are", "are_max": 0.3},
+        "mv-tuned": PUBLISHED | {"detector": "mv", "mv_max": 0.3, "window_s": 0.15},
+        "mag-tuned": PUBLISHED | {"detector": "mag", "mag_max": 0.4, "window_s": 0.15},
     }
     state: NDArray[np.uint8]  # type: ignore[assignment]
 
@@ -98,6 +99,7 @@ class FootEstimator(RowKernel):
         rest.bias_max, rest.gravity, rest.gravity_from_rest = p.rest_bias_max, p.gravity, p.gravity_from_rest
         rest.adaptive, rest.shortest = p.init == "adaptive", min(p.init_min_s, p.init_s)
         rest.takes_bias = p.rest_bias
+        rest.bias_prior = p.rest_bias_sigma**2
         rest.quietest = np.inf
         rest.index = -1
         steps.min_s, steps.min_m = p.step_min_s, p.step_min_m

@@ -27,7 +27,12 @@ FILTER: Fields = [
     ("q_acc", "f8"),
     ("q_gyr_walk", "f8"),
     ("q_acc_walk", "f8"),
+    ("q_scale", "f8"),
     ("r_vel", "f8"),
+    ("lasting", "f8"),
+    ("tilt", "f8"),
+    ("pivot", "f8", (2,)),
+    ("stance_vel", "f8", (3,)),
     ("r_zaru", "f8"),
     ("zaru_after", "f8"),
     ("zaru_rate", "f8"),
@@ -77,13 +82,14 @@ Foot15IezZaruAidedParams = with_parts(Foot15IezZaruParams, "Foot15IezZaruAidedPa
 
 
 @inlined
-def predict(s: Any, dt: float) -> None:
+def predict(s: Any, r: Any) -> None:
     """Carry P over one time step: F P Fᵀ + Q (eqs 3.34–3.37 with the bias columns of 3.43)."""
+    dt, lasting = r.dt, max(r.dt, s.lasting)
     kalman.predict_motion(s.P, ATT, POS, VEL, s.force, dt)
     kalman.predict_bias(s.P, VEL, BIAS_ACC, s.rot, dt)
     kalman.predict_bias(s.P, ATT, BIAS_GYR, s.rot, dt)
-    kalman.add_noise(s.P, ATT, s.q_gyr * dt * dt)
-    kalman.add_noise(s.P, VEL, s.q_acc * dt * dt)
+    kalman.add_noise(s.P, ATT, base.turn_noise(s, r) * dt * lasting)
+    kalman.add_noise(s.P, VEL, s.q_acc * dt * lasting)
     kalman.add_noise(s.P, BIAS_GYR, s.q_gyr_walk * dt)
     kalman.add_noise(s.P, BIAS_ACC, s.q_acc_walk * dt)
     kalman.mirror(s.P)
@@ -93,8 +99,10 @@ def predict(s: Any, dt: float) -> None:
 def correct(s: Any, r: Any) -> None:
     """Correct by zero velocity and, where the foot really rests, by zero angular rate (eq 3.44)."""
     kalman.clear(s.dx)
+    base.rolling_velocity(s, r, s.stance_vel)
+    variance = base.stance_variance(s, r.dt)
     for i in range(3):
-        kalman.update(s, VEL + i, s.vel[i], s.r_vel, 0)
+        kalman.update(s, VEL + i, s.vel[i] - s.stance_vel[i], variance, 0)
     if core.at_rest(s, r, s.zaru_after, s.zaru_rate):
         for i in range(3):
             # Measured rate = true bias at rest, so the bias estimate's error is seen directly.
@@ -115,11 +123,21 @@ def feed_back(s: Any) -> None:
 
 
 @compiled
+def believe_rest(s: Any) -> None:
+    """Write what the rest leaves open into P: of the tilt, and of the biases where their priors are 0."""
+    base.believe_rest(s, ATT)
+    for i in range(3):
+        s.P[BIAS_GYR + i, BIAS_GYR + i] = max(s.P[BIAS_GYR + i, BIAS_GYR + i], s.rest.bias_variance)
+
+
+@compiled
 def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
     r = core.release(s, ring)
-    if not core.starts(s) and s.started:
+    if core.starts(s):
+        believe_rest(s)
+    elif s.started:
         strapdown.advance(s, r)
-        predict(s, r.dt)
+        predict(s, r)
         if r.still:
             correct(s, r)
     if s.aids.on and aid(s, r, ATT, POS):
@@ -166,7 +184,10 @@ def configure(record: Any, params: Any) -> None:
     """Write the noise variances, the gates and the initial covariance into a state's record."""
     record.q_gyr, record.q_acc = params.sigma_gyr**2, params.sigma_acc**2
     record.q_gyr_walk, record.q_acc_walk = params.sigma_gyr_walk**2, params.sigma_acc_walk**2
+    record.q_scale = params.sigma_scale**2
     record.r_vel, record.r_zaru = params.sigma_zupt**2, params.sigma_zaru**2
+    record.lasting, record.tilt = params.noise_s, params.sigma_tilt
+    record.pivot[0], record.pivot[1] = params.pivot_below_m, params.pivot_behind_m
     record.zaru_after, record.zaru_rate = params.zaru_after_s, params.zaru_gyr_max
     for i in range(3):
         record.P[BIAS_GYR + i, BIAS_GYR + i] = params.sigma_gyr_bias0**2

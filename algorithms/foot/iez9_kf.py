@@ -87,6 +87,15 @@ Foot9IezKfAllParams = with_parts(Foot9IezKfParams, "Foot9IezKfAllParams", __name
 
 
 @inlined
+def _believe_rest(s: Any) -> None:
+    """Begin with the tilt and the bias as sure as the rest leaves them."""
+    P = s.orientation.P
+    for i in range(3):
+        P[TILT + i, TILT + i] = s.P[base.ATT + i, base.ATT + i]
+        P[BIAS + i, BIAS + i] = max(P[BIAS + i, BIAS + i], s.rest.bias_variance)
+
+
+@inlined
 def _predict(s: Any, dt: float) -> None:
     o = s.orientation
     kalman.predict_bias(o.P, TILT, BIAS, s.rot, dt)
@@ -137,11 +146,14 @@ def _advance(s: Any, r: Any) -> None:
 @compiled
 def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
     r = core.release(s, ring)
-    if not core.starts(s) and s.started:
+    if core.starts(s):
+        base.believe_rest(s, base.ATT)
+        _believe_rest(s)
+    elif s.started:
         _advance(s, r)
-        base.predict(s, r.dt)
+        base.predict(s, r)
         if r.still:
-            base.zero_velocity(s, 0 if s.zupt_turns else base.POS)
+            base.zero_velocity(s, r, 0 if s.zupt_turns else base.POS)
     core.emit(s, r, out)
     core.emit_sigma(s, base.POS, base.VEL, base.ATT, out)
     if s.started:

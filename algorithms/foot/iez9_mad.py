@@ -119,11 +119,13 @@ def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
     r = core.release(s, ring)
     if core.starts(s):
         _take_over(s)
+        base.believe_rest(s, base.ATT)
+        s.unknown_bias = s.rest.bias_variance
     elif s.started:
         _advance(s, r)
-        base.predict(s, r.dt)
+        base.predict(s, r)
         if r.still:
-            base.zero_velocity(s, 0 if s.zupt_turns else base.POS)
+            base.zero_velocity(s, r, 0 if s.zupt_turns else base.POS)
             if s.zupt_turns:
                 _take_over(s)
     core.emit(s, r, out)

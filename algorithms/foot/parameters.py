@@ -37,7 +37,7 @@ class FootParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     window_s: Annotated[
         float,
         meta(
-            "Length of the statistic's window; 0: the detector's own (c1c2c3 0.1, pitch 0.2, gait 0.025, others 0.05)",
+            "Length of the statistic's window; 0: the detector's own (c1c2c3 0.1, pitch 0.2, gait 0.075, others 0.05)",
             "s",
             f"{DISSERTATION}: n = 5…10 and 20 samples at 100 Hz; Skog et al. 2010: 5 samples",
             ge=0.0,
@@ -104,6 +104,16 @@ class FootParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             source="dissertation, section 3.6",
         ),
     ] = True
+    rest_bias_sigma: Annotated[
+        float,
+        meta(
+            "adaptive: standard deviation of an axis' bias before the rest is seen; a restless rest counts the "
+            "less; 0: nothing is known",
+            "rad/s",
+            "1 °/s: industrial MEMS",
+            ge=0.0,
+        ),
+    ] = 0.0175
     gravity: Annotated[float, meta("Local gravity", "m/s²", "dissertation", gt=0.0, le=30.0)] = 9.81
     gravity_from_rest: Annotated[
         bool,

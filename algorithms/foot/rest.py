@@ -18,8 +18,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
-
 from ..numerics.compiled import compiled, inlined
 from ..numerics.records import record_type
 from ..numerics.strapdown import level
@@ -32,8 +30,6 @@ PIECES = 4
 """Half seconds of a rest are looked at in steps of such pieces (s), so many at a time."""
 LEAST_SPREAD = 1e-4
 """rad/s: no sensor is quieter; keeps weights finite."""
-SWAY_S = 0.25
-"""s: how long the sway of a standing foot keeps its direction, measured on walks that end in a second rest."""
 
 PIECE = record_type(
     ("elapsed", "f8"),
@@ -64,11 +60,13 @@ REST = record_type(
     ("moved_before", "i8"),  # samples before it that are not
     ("pieces", PIECE, (PIECES,)),  # the newest pieces of the rest, a ring
     ("n_pieces", "i8"),  # whole ones so far
+    ("rate", "f8", (3,)),  # mean rate of the newest half second
     ("quietest", "f8"),  # variance of the rate in the quietest half second, rad²/s²; infinite without one
     ("bias_prior", "f8"),  # variance of an axis' bias before the rest is seen, rad²/s²; 0 unknown
     ("weights", "f8"),  # sum of the half seconds' weights
     ("weights_squared", "f8"),  # sum of their squares
     ("weighted", "f8", (3,)),  # weighted sum of their mean rates
+    ("sway", "f8"),  # weighted sum of the variances of their pieces' means, an axis, rad²/s²
     ("bias_variance", "f8"),  # of an axis' bias after the rest, rad²/s²; 0 where it is not known
 )
 
@@ -127,18 +125,23 @@ def _weigh(rest: Any) -> None:
     variance = 0.0
     for k in range(PIECES):
         variance += rest.pieces[k].squares / n
-    mean = np.zeros(3)
+    sway = 0.0
     for i in range(3):
+        rest.rate[i] = 0.0
         for k in range(PIECES):
-            mean[i] += rest.pieces[k].total[i] / n
-        variance -= mean[i] * mean[i]
+            rest.rate[i] += rest.pieces[k].total[i] / n
+        variance -= rest.rate[i] * rest.rate[i]
+        for k in range(PIECES):
+            off = rest.pieces[k].total[i] / rest.pieces[k].count - rest.rate[i]
+            sway += off * off / (3 * (PIECES - 1))
     variance = max(variance, 0.0)
     rest.quietest = min(rest.quietest, variance)
     weight = 1.0 / (variance + LEAST_SPREAD * LEAST_SPREAD) ** 4
     rest.weights += weight
     rest.weights_squared += weight * weight
+    rest.sway += weight * sway
     for i in range(3):
-        rest.weighted[i] += weight * mean[i]
+        rest.weighted[i] += weight * rest.rate[i]
 
 
 @compiled
@@ -148,7 +151,8 @@ def bias_of(rest: Any, bias: Any) -> None:
         # So many half seconds that overlap by three quarters count.
         n = rest.weights * rest.weights / rest.weights_squared
         length = PIECE_S * (PIECES + n - 1.0)
-        variance = (rest.quietest + LEAST_SPREAD * LEAST_SPREAD) / 3.0 * min(1.0, SWAY_S / length)
+        # The sway of a standing foot lasts for about half a second: so far apart its means are independent.
+        variance = rest.sway / rest.weights * PIECES * PIECE_S / length + LEAST_SPREAD * LEAST_SPREAD
         for i in range(3):
             bias[i] = rest.weighted[i] / rest.weights
     else:
@@ -191,6 +195,7 @@ def watch(rest: Any, r: Any, k: int, time: float) -> bool:
             rest.n_pieces = 0
             rest.weights = 0.0
             rest.weights_squared = 0.0
+            rest.sway = 0.0
             for i in range(3):
                 rest.weighted[i] = 0.0
             _clear(rest.pieces[0])

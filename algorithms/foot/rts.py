@@ -16,6 +16,7 @@ from ..numerics.rotations import quat_of, set_quat, turn_nav
 from . import core
 from . import iez15_zaru as base
 from .estimator import FootEstimator
+from .iez9 import rolling_velocity, stance_variance
 from .iez15_zaru import ATT, BIAS_ACC, BIAS_GYR, POS, VEL, N
 from .parameters import with_parts
 
@@ -58,8 +59,10 @@ def _update(s: Any, log: Any, index: int, error: float, variance: float) -> None
 def _correct(s: Any, r: Any, log: Any) -> None:
     """Do what :func:`.iez15_zaru.correct` does, and note every update."""
     kalman.clear(s.dx)
+    rolling_velocity(s, r, s.stance_vel)
+    variance = stance_variance(s, r.dt)
     for i in range(3):
-        _update(s, log, VEL + i, s.vel[i], s.r_vel)
+        _update(s, log, VEL + i, s.vel[i] - s.stance_vel[i], variance)
     if core.at_rest(s, r, s.zaru_after, s.zaru_rate):
         for i in range(3):
             _update(s, log, BIAS_GYR + i, s.bias_gyr[i] - r.gyr[i], s.r_zaru)
@@ -73,6 +76,7 @@ def _navigate(s: Any, ring: Any, out: FloatArray, log: Any) -> None:
     log.n_updates = 0
     if core.starts(s):
         log.stage = START
+        base.believe_rest(s)
     elif s.started:
         log.stage = NAVIGATED
         strapdown.advance(s, r)
@@ -81,7 +85,7 @@ def _navigate(s: Any, ring: Any, out: FloatArray, log: Any) -> None:
             log.force[i] = s.force[i]
             for j in range(3):
                 log.rot[i, j] = s.rot[i, j]
-        base.predict(s, r.dt)
+        base.predict(s, r)
         if r.still:
             _correct(s, r, log)
     for i in range(N):

@@ -112,12 +112,13 @@ def _spread(d: FloatArray, force: FloatArray, trapezoid: bool, dt: float) -> Non
 
 
 @compiled
-def predict(s: Any, dt: float) -> None:
+def predict(s: Any, r: Any) -> None:
     """Carry P, and the second-order part of the mean, over one time step by the unscented transform.
 
     Runs after :func:`.strapdown.advance`, which has carried the nominal navigation; ``s.step_force`` is set.
     Attitude deviations have no mean of their own, so only velocity and position move.
     """
+    dt, lasting = r.dt, max(r.dt, s.lasting)
     semidefinite_root(s.P, s.root)
     d = s.deviation
     for i in range(N):
@@ -144,15 +145,18 @@ def predict(s: Any, dt: float) -> None:
     for i in range(3):
         s.vel[i] -= s.centre[VEL + i]
         s.pos[i] -= s.centre[POS + i]
-    kalman.add_noise(s.P, ATT, s.q_gyr * dt * dt)
-    kalman.add_noise(s.P, VEL, s.q_acc * dt * dt)
+    kalman.add_noise(s.P, ATT, base.turn_noise(s, r) * dt * lasting)
+    kalman.add_noise(s.P, VEL, s.q_acc * dt * lasting)
     kalman.mirror(s.P)
 
 
 @compiled
 def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
     r = core.release(s, ring)
-    if not core.starts(s) and s.started:
+    if core.starts(s):
+        base.believe_rest(s, ATT)
+        s.unknown_bias = s.rest.bias_variance
+    elif s.started:
         for i in range(3):
             s.step_force[i] = s.acc_n[i]
         strapdown.advance(s, r)
@@ -162,9 +166,9 @@ def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
             else:
                 s.step_force[i] = s.acc_n[i]
         s.step_force[2] += s.gravity
-        predict(s, r.dt)
+        predict(s, r)
         if r.still:
-            base.zero_velocity(s, 0)
+            base.zero_velocity(s, r, 0)
     core.emit(s, r, out)
     core.emit_sigma(s, POS, VEL, ATT, out)
     core.emit_detector(r, core.AFTER_SIGMA, out)

@@ -95,7 +95,7 @@ class Gait(Detector):
         ("tail", "i8"),
     )
     statistics: ClassVar[tuple[str, ...]] = ("shoe", "threshold")
-    window_s: ClassVar[float] = 0.025
+    window_s: ClassVar[float] = 0.075
     cleaning: ClassVar[str] = "none"
 
     @classmethod
