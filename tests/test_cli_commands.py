@@ -55,7 +55,7 @@ def test_formats_for_a_person() -> None:
 def test_estimators_have_parameters_with_units_and_defaults() -> None:
     entries = {e["name"]: e for e in marcha("estimators", "--json").document["estimators"]}
     sigma = {p["name"]: p for p in entries["foot.9iez"]["parameters"]}["sigma_acc"]
-    assert sigma["default"] == pytest.approx(0.1)
+    assert sigma["default"] == pytest.approx(0.35)
     assert sigma["unit"] == "m/s²"
     assert sigma["description"]
 
@@ -267,7 +267,7 @@ def test_replay_names_the_alignment_of_its_errors(folder: Path) -> None:
 
 
 def test_what_holds_for_every_run_is_said_once(folder: Path) -> None:
-    several = ("-e", "foot.9iez", "-e", "foot.naive", "-p", "init_s=600")
+    several = ("-e", "foot.9iez", "-e", "foot.naive", "-p", "init=fixed", "-p", "init_s=600")
     done = marcha("replay", folder / "walk.mcap", *several)
     assert done.code == 3
     assert [line.split(":")[0] for line in done.out.splitlines() if "no_rest" in line] in (

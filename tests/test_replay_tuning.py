@@ -38,7 +38,7 @@ def walks(tmp_path_factory: pytest.TempPathFactory) -> list[Any]:
 def grid(walks: list[Any]) -> rp.Tuned:
     return rp.tune(
         walks[0],
-        "foot.9iez[detector=mag]",
+        "foot.9iez[preset=published,detector=mag]",
         {"mag_max": "0.03:300:5", "cleaning_s": (0.04, 0.06, 0.08, 0.1)},
         inputs=TOPIC,
     )
@@ -63,7 +63,12 @@ def test_the_objective_is_closure_plus_distance_as_replay_measures_them(
     walks: list[Any], grid: rp.Tuned
 ) -> None:
     for row in grid.table.rows(named=True)[::3]:
-        params = {"detector": "mag", "mag_max": row["mag_max"], "cleaning_s": row["cleaning_s"]}
+        params = {
+            "preset": "published",
+            "detector": "mag",
+            "mag_max": row["mag_max"],
+            "cleaning_s": row["cleaning_s"],
+        }
         (run,) = rp.replay(walks[0], ["foot.9iez"], params, inputs=TOPIC).runs
         wanted = run.metrics["closure_percent"] + run.metrics["distance_error_percent"]
         assert row["objective"] == pytest.approx(wanted, rel=1e-12)
@@ -80,7 +85,7 @@ def test_one_coordinate_after_the_other_comes_to_the_same_with_fewer_points(
 ) -> None:
     found = rp.tune(
         walks[0],
-        "foot.9iez[detector=mag]",
+        "foot.9iez[preset=published,detector=mag]",
         {"mag_max": "0.03:300:5", "cleaning_s": (0.04, 0.06, 0.08, 0.1)},
         inputs=TOPIC,
         method="coordinate",
@@ -113,7 +118,9 @@ def test_one_walk_an_end_and_a_plateau_are_warned_of(walks: list[Any]) -> None:
 
 
 def test_the_end_of_a_range_is_warned_of(walks: list[Any]) -> None:
-    found = rp.tune(walks[0], "foot.9iez[detector=mag]", {"mag_max": (0.3, 3.0)}, inputs=TOPIC)
+    found = rp.tune(
+        walks[0], "foot.9iez[preset=published,detector=mag]", {"mag_max": (0.3, 3.0)}, inputs=TOPIC
+    )
     assert any(w.startswith("mag_max=0.3 is the end") for w in found.warnings)
 
 
@@ -125,7 +132,7 @@ def test_combinations_that_make_no_sense_are_passed_over(walks: list[Any]) -> No
 
 
 def test_a_run_that_must_not_be_used_is_never_the_best(walks: list[Any]) -> None:
-    found = rp.tune(walks[0], "foot.9iez", {"init_s": (2.0, 500.0)}, inputs=TOPIC)
+    found = rp.tune(walks[0], "foot.9iez[init=fixed]", {"init_s": (2.0, 500.0)}, inputs=TOPIC)
     lost = found.table.filter(init_s=500.0).row(0, named=True)
     assert lost["objective"] == math.inf
     assert lost["failed"] == lost["runs"] == 1
@@ -209,11 +216,13 @@ def test_what_is_no_range_is_refused(text: str) -> None:
 
 def test_the_command_says_what_the_library_found(walks: list[Any]) -> None:
     ran = marcha(
-        "tune", walks[0].path, "-e", "foot.9iez[detector=mag]", "-p", "mag_max=0.03:300:5",
+        "tune", walks[0].path, "-e", "foot.9iez[preset=published,detector=mag]", "-p", "mag_max=0.03:300:5",
         "--input", TOPIC[0], "--json",
     )  # fmt: skip
     assert ran.code == 0
-    found = rp.tune(walks[0], "foot.9iez[detector=mag]", {"mag_max": "0.03:300:5"}, inputs=TOPIC)
+    found = rp.tune(
+        walks[0], "foot.9iez[preset=published,detector=mag]", {"mag_max": "0.03:300:5"}, inputs=TOPIC
+    )
     assert ran.document["params"] == found.params
     assert ran.document["objective_percent"] == pytest.approx(found.objective)
     assert ran.document["warnings"] == list(found.warnings)

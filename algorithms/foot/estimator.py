@@ -77,10 +77,10 @@ class FootEstimator(RowKernel):
         "published": PUBLISHED,
         "short-rest": PUBLISHED | {"init_s": 0.3},
         "live": PUBLISHED | {"window_side": "trailing", "cleaning": "median"},
-        "shoe-tuned": PUBLISHED | {"detector": "shoe", "shoe_max": 1e5},
-        "are-tuned": PUBLISHED | {"detector": "are", "are_max": 0.3},
-        "mv-tuned": PUBLISHED | {"detector": "mv", "mv_max": 0.3, "window_s": 0.15},
-        "mag-tuned": PUBLISHED | {"detector": "mag", "mag_max": 0.4, "window_s": 0.15},
+        "shoe-tuned": {"detector": "shoe", "shoe_max": 1e5},
+        "are-tuned": {"detector": "are", "are_max": 0.3},
+        "mv-tuned": {"detector": "mv", "mv_max": 0.3, "window_s": 0.15},
+        "mag-tuned": {"detector": "mag", "mag_max": 0.4, "window_s": 0.15},
     }
     state: NDArray[np.uint8]  # type: ignore[assignment]
 

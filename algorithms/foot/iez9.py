@@ -50,7 +50,7 @@ PUBLISHED: dict[str, Any] = FootEstimator.presets["published"] | {
 }
 """The source's noise, and its foot that stands as a stone."""
 PRESETS: dict[str, dict[str, Any]] = {
-    name: PUBLISHED | values if name != "adaptive" else values
+    name: PUBLISHED | values if name in ("published", "short-rest", "live") else values
     for name, values in FootEstimator.presets.items()
 } | {"device": PUBLISHED | {"gravity_from_rest": True, "sigma_acc": 0.16}}
 """``device``: as sure as the errors of an uncalibrated MPU-6050 allow (docs/estimators.md)."""
