@@ -66,7 +66,7 @@ COMMANDS: tuple[tuple[Group, str, str, str], ...] = (
         HAND,
         "report",
         "report:report",
-        "Write one page about recordings: figures, errors, annotations, origin.",
+        "Write one HTML page about recordings: figures, errors, annotations, origin.",
     ),
     (
         HAND,

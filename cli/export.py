@@ -16,6 +16,7 @@ from .options import (
     Output,
     Strings,
     instant,
+    recordings,
     settings,
 )
 
@@ -24,9 +25,7 @@ if TYPE_CHECKING:
 
 
 def export(
-    path: Path,
-    /,
-    *,
+    *paths: Path,
     to: Annotated[str, Parameter(name=("--to", "-t"))],
     output: Output,
     topic: Annotated[Strings, Parameter(name="--topic")] = (),
@@ -38,10 +37,13 @@ def export(
 ) -> Outcome:
     """Write a recording, or part of it, in another tool's format.
 
+    Several recordings, or a folder of them, become one BIDS dataset (their
+    names state the subjects: sub-01_task-walk.mcap), or a file each in a folder.
+
     Parameters
     ----------
-    path : Path
-        The recording.
+    paths : Path
+        Recordings, or folders of them.
     to : str
         Format: mcap, csv, parquet, bids, gpx, eaf, rrd … (marcha formats lists them).
     output : Path
@@ -58,8 +60,12 @@ def export(
         Replace an earlier export.
     """
     from .. import recording
+    from ..recording.errors import UsageError
 
-    rec = recording.open(path)
+    recs = [recording.open(path) for path in recordings(paths, "export")]
+    if len(recs) > 1 and (start or end):
+        raise UsageError("export: --start and --end are times of one recording; give one")
+    rec = recs[0]
     options: dict[str, Any] = dict(settings(option, "--set"))
     chosen = {
         "topics": topic,
@@ -67,7 +73,31 @@ def export(
         "end_ns": instant(end, rec, "--end"),
     }
     options |= {key: value for key, value in chosen.items() if value not in (None, ())}
+    if len(recs) > 1 or any(path.is_dir() for path in paths):
+        return _hand_on_all(recs, to, output, options, force=force)
     return hand_on(rec, to, output, options, force=force)
+
+
+def _hand_on_all(
+    recs: list[Recording], to: str, output: Path, options: dict[str, Any], *, force: bool
+) -> Outcome:
+    """Export several, after saying what the format cannot hold of each."""
+    from .. import export as ex
+
+    missing = {str(rec.path): ex.losses(rec, to, options=options) for rec in recs}
+    for name, losses in missing.items():
+        for line in losses:
+            complain(f"{name}: {to} does not hold: {line}")
+    files = [str(file) for file in ex.export_all(recs, to, output, options=options, overwrite=force)]
+    say_losses(*recs)
+    document = {
+        "paths": [str(rec.path) for rec in recs],
+        "format": to,
+        "output": str(output),
+        "files": files,
+        "not_held": missing,
+    }
+    return Outcome(document, [Heading(f"wrote {output} ({len(files)} files)")])
 
 
 def hand_on(rec: Recording, to: str, output: Path, options: dict[str, Any], *, force: bool) -> Outcome:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -182,3 +183,24 @@ def plain(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return value.tolist()
     raise NotImplementedError(f"{type(value).__name__} has no JSON form")
+
+
+def recordings(paths: Sequence[Path], command: str) -> list[Path]:
+    """Return the recordings that files and folders stand for; those of a folder by name.
+
+    Raises
+    ------
+    UsageError
+        None is named, or a folder holds none.
+    """
+    from ..recording.errors import UsageError
+
+    if not paths:
+        raise UsageError(f"{command}: name a recording or a folder of recordings")
+    found: list[Path] = []
+    for path in paths:
+        inside = sorted(path.rglob("*.mcap")) if path.is_dir() else [path]
+        if not inside:
+            raise UsageError(f"{path}: holds no recording (*.mcap); `marcha convert` makes them of raw logs")
+        found += inside
+    return list(dict.fromkeys(found))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from .console import Heading, Outcome, progress
 from .contents import say_losses
-from .options import DEFAULT, Common, Force, Output
+from .options import DEFAULT, Common, Force, Output, recordings
 
 
 def report(
@@ -36,18 +36,9 @@ def report(
         Replace an existing file.
     """
     from .. import recording
-    from ..recording.errors import UsageError
     from ..viz.recording_page import write_page
 
-    if not paths:
-        raise UsageError("report: name a recording or a folder of recordings")
-    found: list[Path] = []
-    for path in paths:
-        inside = sorted(path.rglob("*.mcap")) if path.is_dir() else [path]
-        if not inside:
-            raise UsageError(f"{path}: holds no recording (*.mcap); `marcha convert` makes them of raw logs")
-        found += inside
-    recs = [recording.open(path) for path in dict.fromkeys(found)]
+    recs = [recording.open(path) for path in recordings(paths, "report")]
     with progress("report", common) as said:
         write_page(recs, output, by=by, picture=not no_picture, overwrite=force, progress=said)
     say_losses(*recs)

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from .contract import Exporter
-from .registry import available, export, losses
+from .registry import available, export, export_all, losses
 
-__all__ = ["Exporter", "available", "export", "losses"]
+__all__ = ["Exporter", "available", "export", "export_all", "losses"]

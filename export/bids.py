@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -14,17 +14,17 @@ import polars as pl
 
 from ..recording import Recording
 from ..recording.errors import UsageError
+from ..recording.events import bids_events, events_text, sidecar, to_events
 from ..recording.selection import Selection, selected_topics, within
-from .events import events_text, sidecar, to_events
 from .facts import origin, pretty
 from .folder import whole_folder
-from .labels.side import plain
 from .series import rate_hz
 from .tables import EVENT, meaning
 
 VERSION = "1.9.0"
 ESTIMATE = "/estimate/"
 MARKER = "dataset_description.json"
+KNOWN_AT = "t_log_ns"
 _EPOCH_NS = 946_684_800 * 10**9
 _KINDS = {"acc": "ACCEL", "gyr": "GYRO", "mag": "MAGN", "quat": "ORNT", "pos": "POS", "vel": "VEL"}
 _UNITS = {"m/s²": "m/s^2", "°": "deg", "°C": "oC", "-": "n/a", "": "n/a", "as named": "n/a", "Pa": "Pa"}
@@ -69,9 +69,16 @@ class BidsExporter:
             for t in selected_topics(rec, options)
             if rec.channels[t].schema != EVENT and not numeric_columns(rec, t)
         ]
-        losses = ["line breaks and tabs in labels: they are written as signs"]
+        losses = ["line breaks, tabs and quotation marks in labels: written as signs, whole in sourcedata"]
         if odd:
             losses.append(f"channels without numbers: {', '.join(odd)}")
+        texts = [
+            f"{t} {', '.join(text_columns(rec, t))}"
+            for t in selected_topics(rec, options)
+            if t not in odd and rec.channels[t].schema != EVENT and text_columns(rec, t)
+        ]
+        if texts:
+            losses.append(f"columns of text: {'; '.join(texts)}")
         if rec.attachments:
             losses.append(f"{len(rec.attachments)} attachments")
         return losses
@@ -79,6 +86,35 @@ class BidsExporter:
     def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:
         """Write the dataset; see :class:`marcha.export.Exporter`."""
         return write_dataset({rec: options}, path, overwrite=overwrite)
+
+    def export_all(
+        self, recs: Sequence[Recording], path: Path, options: Any, *, overwrite: bool = False
+    ) -> list[Path]:
+        """Write one dataset of several recordings; their file names state their entities."""
+        return write_dataset({rec: entities(rec, options) for rec in recs}, path, overwrite=overwrite)
+
+
+_ENTITIES = re.compile(
+    r"sub-(?P<subject>[0-9A-Za-z]+)(_ses-(?P<session>[0-9A-Za-z]+))?(_task-(?P<task>[0-9A-Za-z]+))?"
+    r"(_tracksys-[0-9A-Za-z]+)?(_run-(?P<run>[0-9]+))?(_[^/]*)?"
+)
+
+
+def entities(rec: Recording, options: BidsOptions) -> BidsOptions:
+    """Return options with the subject, session, task and run that a recording's file name states.
+
+    Raises
+    ------
+    UsageError
+        The name states no subject.
+    """
+    match = _ENTITIES.fullmatch(rec.path.stem)
+    if match is None:
+        raise UsageError(
+            f"{rec.path}: a dataset of several recordings needs their subjects; name the files "
+            "sub-01_task-walk.mcap (sub-…_ses-…_task-…_run-…)"
+        )
+    return msgspec.structs.replace(options, **{k: v for k, v in match.groupdict().items() if v})
 
 
 def write_dataset(
@@ -189,27 +225,44 @@ def _write_recording(files: _Files, rec: Recording, options: BidsOptions, about:
     run = f"_run-{options.run}" if options.run else ""
     stem = _stem(options)
     scans = []
+    columns: dict[str, list[tuple[str, str, str, str]]] = {}
     for base, chosen in (("", raw), ("derivatives/marcha/", own)):
         for system in systems(rec, chosen, options):
             name = f"{stem}_tracksys-{system.label}{run}"
             if base:
                 name += "_desc-estimate"
-            _write_system(files, rec, options, system, f"{base}{folder}{name}")
+            columns[f"{name}_motion.tsv"] = _write_system(
+                files, rec, options, system, f"{base}{folder}{name}"
+            )
             if not base:
                 scans.append(f"motion/{name}_motion.tsv")
     events = to_events(within(rec.annotations, options), rec.start_ns)
     if events.height:
-        texts = [c for c, dtype in events.schema.items() if dtype == pl.String]
-        events = events.with_columns(
-            pl.col(c).map_elements(plain, pl.String).str.replace_all('"', "″", literal=True) for c in texts
+        files.text(f"sourcedata/{stem}{run}_events.tsv", events_text(events))  # with every sign
+        files.text(
+            f"{folder}{stem}{run}_events.tsv",
+            bids_events(events).write_csv(separator="\t", null_value="n/a", quote_style="never"),
         )
-        files.text(f"{folder}{stem}{run}_events.tsv", events_text(events))
         files.json(f"{folder}{stem}{run}_events.json", sidecar(rec.metadata))
     base = f"sub-{options.subject}{session}"
     files.scans.setdefault(f"{base}/{base.replace('/', '_')}_scans.tsv", []).extend(
         (name, _date(rec)) for name in scans
     )
-    about[f"{stem}{run}"] = {**origin(rec), "metadata": rec.metadata}
+    channels = {
+        t: {
+            "schema": rec.channels[t].schema,
+            "frame_id": rec.channels[t].frame_id,
+            "metadata": rec.channels[t].metadata,
+            "columns": rec.channels[t].columns,
+        }
+        for t in (*raw, *own)
+    }
+    about[f"{stem}{run}"] = {
+        **origin(rec),
+        "channels": channels,
+        "columns": columns,
+        "metadata": rec.metadata,
+    }
     return bool(own)
 
 
@@ -221,10 +274,17 @@ def _date(rec: Recording) -> str:
 
 
 def numeric_columns(rec: Recording, topic: str) -> list[str]:
-    """Return the columns of a channel that are numbers, without times of the clock."""
+    """Return the columns of a channel that are numbers, without the time of each row."""
     empty = rec.table(topic, start_ns=0, end_ns=0)
+    return [n for n, d in empty.schema.items() if (d.is_numeric() or d == pl.Boolean) and n != "t_ns"]
+
+
+def text_columns(rec: Recording, topic: str) -> list[str]:
+    """Return the columns of a channel that a motion table cannot hold."""
     return [
-        n for n, d in empty.schema.items() if (d.is_numeric() or d == pl.Boolean) and not n.endswith("_ns")
+        c
+        for c in rec.table(topic, start_ns=0, end_ns=0).columns
+        if c not in (*numeric_columns(rec, topic), "t_ns")
     ]
 
 
@@ -254,27 +314,40 @@ def systems(rec: Recording, topics: list[str], options: Selection) -> list[Syste
     return out
 
 
-def _write_system(files: _Files, rec: Recording, options: BidsOptions, system: System, stem: str) -> None:
-    tables = {t: rec.table(t, start_ns=options.start_ns, end_ns=options.end_ns) for t in system.topics}
+def _write_system(
+    files: _Files, rec: Recording, options: BidsOptions, system: System, stem: str
+) -> list[tuple[str, str, str, str]]:
+    """Write one tracking system; return where each column comes from."""
+    tables = {
+        t: rec.table(t, start_ns=options.start_ns, end_ns=options.end_ns, log_time=True)
+        for t in system.topics
+    }
     t_ns = next(iter(tables.values()))["t_ns"].to_numpy()
     rate = rate_hz(t_ns)
     columns: dict[str, Any] = {"latency": pl.Series((t_ns - rec.start_ns) / 1e9)}
     rows = [("latency", "n/a", "LATENCY", "n/a", "s", "n/a", rate, "time since the start of the recording")]
+    origin_of: list[tuple[str, str, str, str]] = []  # name in the table, topic, column, kind of number
     for topic, table in tables.items():
         schema = rec.channels[topic].schema
-        for column in numeric_columns(rec, topic):
+        known = [KNOWN_AT] if (table[KNOWN_AT] != table["t_ns"]).any() else []
+        for column in [*numeric_columns(rec, topic), *known]:
             group, _, axis = column.rpartition("_")
-            known = _KINDS.get(group)
+            kind_of = _KINDS.get(group)
             joint = schema == "sensor_msgs/msg/JointState"
-            kind = "JNTANG" if joint and not column.endswith((".vel", ".effort")) else known or "MISC"
+            kind = "JNTANG" if joint and not column.endswith((".vel", ".effort")) else kind_of or "MISC"
             component = axis if axis in ("x", "y", "z") else "n/a"
-            if known == "ORNT":
+            if kind_of == "ORNT":
                 component = f"quat_{axis}"
             about = meaning(schema, column)
+            if column == KNOWN_AT:
+                about = {"unit": "s", "meaning": "when it was known, since the start of the recording"}
             unit = _UNITS.get(about["unit"], about["unit"])
             frame = rec.channels[topic].frame_id or "n/a"
             name = f"{topic.strip('/').replace('/', '_')}_{column}"
             values = table[column]
+            origin_of.append((name, topic, column, str(values.dtype)))
+            if column.endswith("_ns"):  # times of the clock count from the start of the recording
+                values, unit = (values - rec.start_ns) / 1e9, "s"
             columns[name] = values.cast(pl.Int8) if values.dtype == pl.Boolean else values
             if kind == "ORNT":
                 unit = "n/a"
@@ -328,6 +401,7 @@ def _write_system(files: _Files, rec: Recording, options: BidsOptions, system: S
         **{f"{k}ChannelCount": kinds.count(k) for k in _COUNTED if k in kinds},
     }
     files.json(f"{stem}_motion.json", facts)
+    return origin_of
 
 
 def _frame(frame_id: str) -> str:

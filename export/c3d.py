@@ -135,7 +135,11 @@ def _encode(
             for name, column in columns.items():
                 labels.append(f"{topic}/{name}".lstrip("/"))
                 units.append(meaning(rec.channels[topic].schema, name)["unit"].replace("²", "2"))
-                values.append(column if exact else np.interp(at, analog.t_ns.astype(float), column))
+                values.append(
+                    column
+                    if exact
+                    else np.interp(at, analog.t_ns.astype(float), column, left=np.nan, right=np.nan)
+                )
         file["data"]["analogs"] = np.stack(values)[None]
         parameters["ANALOG"]["RATE"]["value"] = [rate * ratio]
         parameters["ANALOG"]["LABELS"]["value"] = labels

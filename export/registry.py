@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -67,11 +67,52 @@ def export(
     OutputExists
         ``path`` exists and ``overwrite`` is false.
     """
+    chosen = _exporter(to)
+    return chosen().export(rec, Path(path), _typed(chosen, options or {}), overwrite=overwrite)
+
+
+def export_all(
+    recs: Sequence[Recording],
+    to: str,
+    path: Path | str,
+    *,
+    options: Mapping[str, Any] | None = None,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write several recordings: one dataset where the format has datasets, else a file or folder each in a folder.
+
+    Parameters
+    ----------
+    recs, to, path, options, overwrite
+        See :func:`export`; ``path`` is a folder.
+
+    Raises
+    ------
+    UsageError
+        Unknown exporter or option, or two recordings of one name.
+    OutputExists
+        An output exists and ``overwrite`` is false.
+    """
+    chosen = _exporter(to)
+    together = getattr(chosen, "export_all", None)
+    if together is not None:
+        return together(chosen(), recs, Path(path), _typed(chosen, options or {}), overwrite=overwrite)
+    names = [rec.path.stem + chosen.suffix for rec in recs]
+    if len(set(names)) != len(names):
+        raise UsageError(f"{path}: two recordings would have one name; export them one by one")
+    Path(path).mkdir(parents=True, exist_ok=True)
+    return [
+        file
+        for rec, name in zip(recs, names, strict=True)
+        for file in export(rec, to, Path(path) / name, options=options, overwrite=overwrite)
+    ]
+
+
+def _exporter(to: str) -> type[Exporter]:
     exporters = available()
     if to not in exporters:
         raise UsageError(f"export format {to!r}: not known; there are {', '.join(exporters)}")
-    chosen = exporters[to]
-    return chosen().export(rec, Path(path), _typed(chosen, options or {}), overwrite=overwrite)
+    return exporters[to]
 
 
 def losses(rec: Recording, to: str, *, options: Mapping[str, Any] | None = None) -> list[str]:
@@ -87,10 +128,7 @@ def losses(rec: Recording, to: str, *, options: Mapping[str, Any] | None = None)
     UsageError
         Unknown exporter or option.
     """
-    exporters = available()
-    if to not in exporters:
-        raise UsageError(f"export format {to!r}: not known; there are {', '.join(exporters)}")
-    chosen = exporters[to]
+    chosen = _exporter(to)
     say = getattr(chosen, "losses", None)  # plug-ins of the first version do not have it
     return say(chosen(), rec, _typed(chosen, options or {})) if say is not None else []
 

@@ -13,9 +13,9 @@ import msgspec
 import polars as pl
 
 from ..recording import SCHEMAS, Channel, Recording
+from ..recording.events import COLUMNS as EVENT_COLUMNS
+from ..recording.events import events_text, sidecar, to_events
 from ..recording.selection import Selection, selected_topics, within
-from .events import COLUMNS as EVENT_COLUMNS
-from .events import events_text, sidecar, to_events
 from .facts import pretty
 from .folder import MARKER, whole_folder
 

@@ -239,6 +239,9 @@ class Import:
         Same rule.
     also_read : sequence of Path
         Files beside the sources that are read with them (a table of footprints, of anchors).
+    annotations : polars.DataFrame, optional
+        Annotations on the source's clock, in the columns of :data:`marcha.recording.annotations.COLUMNS`. May be
+        set while the blocks are read.
     """
 
     def __init__(
@@ -250,7 +253,9 @@ class Import:
         metadata: dict[str, dict[str, str]] | None = None,
         attachments: list[SourceAttachment] | None = None,
         also_read: Sequence[Path] = (),
+        annotations: pl.DataFrame | None = None,
     ) -> None:
+        self.annotations = annotations
         self.channels = tuple(channels)
         self.metadata = metadata if metadata is not None else {}
         self.attachments = attachments if attachments is not None else []
@@ -304,6 +309,9 @@ class Importer(Protocol):
     folders : bool
         Whether a folder or archive can be one recording although ``sniff`` does not know it. Optional; false
         where it is missing.
+    chief : callable
+        ``chief(path) -> Path``: the file that stands for the recording of several files that ``path`` is one of.
+        Optional; each file is a recording of its own where it is missing.
     """
 
     name: ClassVar[str]

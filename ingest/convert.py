@@ -150,6 +150,8 @@ def convert(
                     recording.add_metadata(name, record)
                 for item in merged.attachments:
                     recording.add_attachment(item.name, item.data, item.media_type)
+                for marks in merged.annotations:
+                    recording.add_annotations(marks)
         except OSError as error:
             where = error.filename or out
             raise MarchaError(f"{where}: {error.strerror or error}; nothing was written to {out}") from error
@@ -166,6 +168,7 @@ class _Merged:
         self._records: dict[str, dict[str, str]] = {"plan": floor.metadata} if floor.metadata else {}
         self._clocks: dict[str, str] = {}
         self.attachments: list[SourceAttachment] = list(floor.attachments)
+        self.annotations: list[pl.DataFrame] = []
         self.also_read: list[str] = []
 
     def add(
@@ -197,6 +200,8 @@ class _Merged:
         self._clocks |= {spec.topic: name for spec in specs} | imported.metadata.pop("clocks", {})
         for key, record in _metadata(imported, options, truth).items():
             self._records[key if key not in self._records else f"{key}/{name}"] = record
+        if imported.annotations is not None:
+            self.annotations.append(written.moved(imported.annotations))
         raw = _raw(source.files) if options.keep_source else ()
         given = {a.name for a in self.attachments}  # what the user names beside a log goes before its own
         self.attachments += [a for a in (*imported.attachments, *raw) if a.name not in given]
@@ -304,6 +309,10 @@ class _Writer:
         self._total += table.height
         if self._progress is not None:
             self._progress(self._total)
+
+    def moved(self, annotations: pl.DataFrame) -> pl.DataFrame:
+        """Return annotations on the clock to which the source's messages were moved."""
+        return annotations.with_columns(pl.col("start_ns", "end_ns") + self._shift)
 
     def channels(self) -> list[ConvertedChannel]:
         return [

@@ -99,6 +99,24 @@ def events_text(events: pl.DataFrame) -> str:
     return events.write_csv(separator="\t", null_value="n/a")
 
 
+def bids_events(events: pl.DataFrame) -> pl.DataFrame:
+    """Return the table as strict readers of BIDS take it: no line break, tab or quotation mark in a text."""
+    texts = [c for c, dtype in events.schema.items() if dtype == pl.String and c != "metadata"]
+    return events.with_columns(pl.col(c).map_elements(_unquoted, pl.String) for c in texts)
+
+
+def plain(text: str) -> str:
+    """Return text for formats of one line a label: line breaks and tabs as their pictures (␊, ␍, ␉)."""
+    return text.translate(_PICTURES)
+
+
+def _unquoted(text: str) -> str:
+    return plain(text).replace('"', "″")
+
+
+_PICTURES = {code: 0x2400 + code for code in range(0x20)} | {0x85: 0x2424, 0x2028: 0x2424, 0x2029: 0x2424}
+
+
 def sidecar(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
     """Return the JSON object beside the table: every column, its unit, and the labels that are known."""
     about: dict[str, Any] = {}

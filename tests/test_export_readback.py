@@ -7,6 +7,7 @@ import math
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any, cast
 from xml.etree import ElementTree
@@ -27,6 +28,8 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.io import loadmat
 
 from .contracts.exporter import ROWS, START_NS, example
+
+TOOLS = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
 
 
 @pytest.fixture(scope="module")
@@ -250,14 +253,14 @@ def test_two_recordings_of_one_name_are_refused(rec: Recording, tmp_path: Path) 
 
 
 @pytest.mark.skipif(
-    shutil.which("bids-validator-deno") is None, reason="bids-validator-deno is not installed"
+    shutil.which("bids-validator-deno", path=TOOLS) is None, reason="bids-validator-deno is not installed"
 )
 def test_bids_has_no_error(rec: Recording, tmp_path: Path) -> None:
     other = mr.open(rec.path)
     several = {rec: BidsOptions(subject="01", session="a"), other: BidsOptions(subject="02", run="1")}
     write_dataset(several, tmp_path / "ds")
     done = subprocess.run(
-        ["bids-validator-deno", "--format", "json", str(tmp_path / "ds")],
+        [str(shutil.which("bids-validator-deno", path=TOOLS)), "--format", "json", str(tmp_path / "ds")],
         capture_output=True,
         text=True,
         check=False,

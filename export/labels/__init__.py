@@ -11,8 +11,8 @@ import polars as pl
 from ...recording import Recording
 from ...recording.changes import check_inside
 from ...recording.errors import UsageError
+from ...recording.event_table import read_events
 from ...recording.files import read_small
-from ..events import read_events
 from . import audacity, c3d, elan, textgrid
 from .side import annotations_of
 

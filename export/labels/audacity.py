@@ -8,7 +8,8 @@ import msgspec
 import polars as pl
 
 from ...recording.errors import MarchaError
-from .side import Label, nanoseconds, plain, utf8
+from ...recording.events import plain
+from .side import Label, nanoseconds, utf8
 
 name = "audacity"
 title = "Audacity label track, to the microsecond: one tier plainly, more with [tier] before the text"

@@ -218,11 +218,3 @@ def nanoseconds(path: Path, line: int, text: str, unit_ns: int = 10**9) -> int:
     except InvalidOperation:
         pass
     raise MarchaError(f"{path}: line {line}: {text[:40]!r} is not a time; correct it")
-
-
-def plain(text: str) -> str:
-    """Return text for formats of one line a label: line breaks and tabs as their pictures (␊, ␍, ␉)."""
-    return text.translate(_PICTURES)
-
-
-_PICTURES = {code: 0x2400 + code for code in range(0x20)} | {0x85: 0x2424, 0x2028: 0x2424, 0x2029: 0x2424}

@@ -28,11 +28,16 @@ class AnglesOptions(CommonOptions, frozen=True, kw_only=True):
     ----------
     unit : str or None
         ``deg`` or ``rad``.
+    y_up : bool
+        The frame that orientations are given in has y up, as OpenSim's has: turned so that z is.
     """
 
     unit: Annotated[
         Literal["deg", "rad"] | None, msgspec.Meta(description="unit of angles whose column does not say it")
     ] = None
+    y_up: Annotated[
+        bool, msgspec.Meta(description="y is up in the frame of orientations: turn it so that z is")
+    ] = False
 
 
 class Angles:
@@ -78,6 +83,12 @@ class Angles:
         values, rows = float_rows(path, body, start + 2, " ", columns, report)
         device = {"clock": "device", "time": "column time (s)", "frames": "as the file has them"}
         if quaternions:
+            if options.y_up:
+                w, x, y, z = (values[:, 1 + k :: 4] for k in range(4))
+                turned = np.sqrt(0.5) * np.stack(
+                    (w - x, x + w, y - z, z + y), axis=2
+                )  # +90° about x, then it
+                values = np.column_stack((values[:, 0], turned.reshape(len(values), -1)))
             return _orientations(names[1:], values, rows, report, device)
         degrees = facts.get("indegrees", "").lower() == "yes"
         factor = {n: np.pi / 180 if degrees and not re.search(r"_t[xyz]$", n) else 1.0 for n in names[1:]}

@@ -9,15 +9,17 @@ import json
 import subprocess
 import sys
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+import polars as pl
 
 from ...recording.errors import MarchaError, UsageError
-from ..contract import Import, ReportBuilder
+from ..contract import ChannelSpec, Import, ReportBuilder
 from ..leg import unique_markers
-from ..optical import MarkerOptions, marker_import
+from ..optical import MarkerOptions, blocks_of, marker_import
 from ..units import conversion
 
 READ_S = 300.0
@@ -33,19 +35,30 @@ keys = sorted((k for k in point if k.startswith("LABELS")), key=lambda k: int(k[
 labels = [label for key in keys for label in point[key]["value"]]
 pos = np.ascontiguousarray(c["data"]["points"][:3].transpose(2, 1, 0), dtype="<f8")
 units = point.get("UNITS", {}).get("value", [""])
-head = {"labels": [str(x) for x in labels], "shape": pos.shape, "units": str(units[0]) if len(units) else "",
+analog, event = c["parameters"].get("ANALOG", {}), c["parameters"].get("EVENT", {})
+words = lambda group, key: [str(x) for k in sorted(group) if k.startswith(key) and (k[len(key):] or "1").isdigit()
+                            for x in group[k]["value"]]
+signals = np.ascontiguousarray(c["data"]["analogs"][0].T, dtype="<f8")
+times = np.asarray(event.get("TIMES", {}).get("value", np.zeros((2, 0))), float)
+used = int(np.ravel(event.get("USED", {}).get("value", [0]))[0]) if "USED" in event else 0
+head = {"analog": words(analog, "LABELS"), "analog_units": words(analog, "UNITS"), "analog_shape": signals.shape,
+        "analog_rate_hz": float(c["header"]["analogs"]["frame_rate"]),
+        "events": used, "event_labels": words(event, "LABELS"), "event_contexts": words(event, "CONTEXTS"),
+        "event_s": (60.0 * times[0] + times[1]).tolist() if times.ndim == 2 and len(times) == 2 else [],
+        "labels": [str(x) for x in labels], "shape": pos.shape, "units": str(units[0]) if len(units) else "",
         "rate_hz": float(c["header"]["points"]["frame_rate"]), "first_frame": int(c["header"]["points"]["first_frame"])}
 out = sys.stdout.buffer
 out.write(json.dumps(head).encode() + b"\\n")
 out.write(pos.tobytes())
+out.write(signals.tobytes())
 """
 
 
 class C3d:
-    """Importer ``c3d``: ``/reference/markers``."""
+    """Importer ``c3d``: ``/reference/markers``, analog channels, and events as annotations."""
 
     name: ClassVar[str] = "c3d"
-    title: ClassVar[str] = "C3D marker trajectories"
+    title: ClassVar[str] = "C3D: markers, analog channels, events"
     Options = MarkerOptions
     beside: ClassVar[bool] = True
 
@@ -59,10 +72,12 @@ class C3d:
     def read(self, paths: Sequence[Path], options: MarkerOptions) -> Import:
         """Read one file."""
         path = paths[0]
-        head, pos = _read(path)
+        head, pos, signals = _read(path)
         names = [n.strip() for n in head["labels"]][: pos.shape[1]]
-        if not names or not len(pos):
-            raise MarchaError(f"{path}: holds no marker, or no frame; nothing to convert")
+        if not len(pos) or not (pos.shape[1] or signals.shape[1]):
+            raise MarchaError(
+                f"{path}: holds neither marker nor analog channel, or no frame; nothing to convert"
+            )
         names = unique_markers(names, path, 1)
         if len(names) < pos.shape[1]:
             names += [f"marker{k + 1}" for k in range(len(names), pos.shape[1])]
@@ -78,11 +93,98 @@ class C3d:
             raise MarchaError(f"{path}: its frame rate is {rate:g}; set POINT:RATE")
         t_ns = np.rint((head["first_frame"] + np.arange(len(pos))) * (1e9 / rate)).astype(np.int64)
         device = {"time": "frames at the header's rate; frame 1 is at 0", "rate_hz": f"{rate:g}"}
-        return marker_import(t_ns, np.arange(1, len(pos) + 1), names, pos * factor, report, device, options)
+        analog = _analog(path, head, signals, rate)
+        if pos.shape[1]:
+            found = marker_import(
+                t_ns, np.arange(1, len(pos) + 1), names, pos * factor, report, device, options
+            )
+            channels, blocks = list(found.channels), found.blocks()
+        else:
+            channels, blocks = [], iter(())
+        at = np.rint(
+            head["first_frame"] * (1e9 / rate)
+            + np.arange(len(signals)) * (1e9 / (head["analog_rate_hz"] or rate))
+        )
+        rows = blocks_of(
+            at.astype(np.int64), np.arange(1, len(signals) + 1), [(s.topic, t) for s, t in analog], report
+        )
+        return Import(
+            channels=[*channels, *(spec for spec, _ in analog)],
+            blocks=chain(blocks, rows if analog else ()),
+            report=report,
+            metadata={"device": {"clock": "device", "frames": "as the capture system has them", **device}},
+            annotations=_events(path, head),
+        )
 
 
-def _read(path: Path) -> tuple[dict[str, Any], np.ndarray]:
-    """Return header facts and positions (frames, markers, 3) in the file's unit; NaN where not seen."""
+def _analog(
+    path: Path, head: dict[str, Any], signals: np.ndarray, rate: float
+) -> list[tuple[ChannelSpec, pl.DataFrame]]:
+    """Return analog channels: inertial ones (``foot/imu1/acc_x``) as readings, others as values under their labels."""
+    labels = [n.strip() for n in head["analog"]][: signals.shape[1]]
+    labels += [f"analog{k + 1}" for k in range(len(labels), signals.shape[1])]
+    units = [u.strip() for u in head["analog_units"]] + [""] * len(labels)
+    groups: dict[str, dict[str, int]] = {}
+    for k, label in enumerate(labels):
+        topic, _, column = label.rpartition("/")
+        groups.setdefault(topic, {})[column] = k
+    found: list[tuple[ChannelSpec, pl.DataFrame]] = []
+    others: list[int] = []
+    for topic, columns in groups.items():
+        schema = next(
+            (s for s, sets in _SENSORS.items() if topic and any(set(columns) == c for c in sets)), None
+        )
+        if schema is None:
+            others += columns.values()
+            continue
+        table = {}
+        for column, k in columns.items():
+            try:
+                factor, _ = conversion(units[k], _SENSOR_UNITS[column.partition("_")[0]])
+            except UsageError as error:
+                raise MarchaError(f"{path}: ANALOG:UNITS of {labels[k]}: {error}") from None
+            table[column] = signals[:, k] * factor
+        found.append((ChannelSpec(f"/{topic}", schema, "", tuple(table)), pl.DataFrame(table)))
+    if others:
+        names = unique_markers([labels[k] for k in others], path, 1)
+        about = {f"unit.{n}": units[k] for n, k in zip(names, others, strict=True) if units[k]}
+        values = pl.DataFrame({n: signals[:, k] for n, k in zip(names, others, strict=True)})
+        found.append(
+            (ChannelSpec("/analog/values", "marcha_msgs/msg/NamedValues", "", tuple(names), about), values)
+        )
+    return found
+
+
+def _events(path: Path, head: dict[str, Any]) -> pl.DataFrame | None:
+    """Return events as instants; a context (left, right, general) is their tier."""
+    used, seconds, labels = head["events"], head["event_s"], head["event_labels"]
+    if not used:
+        return None
+    if len(seconds) < used or len(labels) < used or not np.isfinite(seconds[:used]).all():
+        raise MarchaError(
+            f"{path}: EVENT: says {used} events, has {len(seconds)} times and {len(labels)} labels; "
+            "remove the group or export the file again"
+        )
+    contexts = [c.strip() for c in head["event_contexts"]] + [""] * used
+    at = pl.Series(np.rint(np.array(seconds[:used]) * 1e9).astype(np.int64))
+    tiers = [c or "events" for c in contexts[:used]]
+    return pl.DataFrame(
+        {"tier": tiers, "start_ns": at, "end_ns": at, "label": [x.strip() for x in labels[:used]]}
+    )
+
+
+_XYZ = {k: {f"{k}_{a}" for a in "xyz"} for k in ("acc", "gyr", "mag")}
+_SENSORS = {
+    "sensor_msgs/msg/Imu": (_XYZ["acc"] | _XYZ["gyr"], _XYZ["acc"], _XYZ["gyr"]),
+    "sensor_msgs/msg/MagneticField": (_XYZ["mag"],),
+}
+_SENSOR_UNITS = {"acc": "m/s²", "gyr": "rad/s", "mag": "T"}
+
+
+def _read(path: Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
+    """Return header facts, positions (frames, markers, 3) in the file's unit, NaN where not seen, and analog
+    signals (samples, channels).
+    """
     if not path.is_file():
         raise MarchaError(f"{path}: no such file")
     with path.open("rb") as file:
@@ -104,5 +206,8 @@ def _read(path: Path) -> tuple[dict[str, Any], np.ndarray]:
         )
         raise MarchaError(f"{path}: a damaged C3D file ({why}); export it again")
     facts = json.loads(head)
-    pos = np.frombuffer(data, "<f8").reshape(facts["shape"]).astype(float)
-    return facts, np.where(np.isfinite(pos).all(axis=2, keepdims=True), pos, np.nan)
+    size = int(np.prod(facts["shape"]))
+    numbers = np.frombuffer(data, "<f8")
+    pos = numbers[:size].reshape(facts["shape"]).astype(float)
+    signals = numbers[size:].reshape(facts["analog_shape"]).astype(float)
+    return facts, np.where(np.isfinite(pos).all(axis=2, keepdims=True), pos, np.nan), signals

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
+import msgspec
 import numpy as np
 
 from ...recording.errors import MarchaError, UsageError
@@ -15,19 +16,31 @@ from ..optical import MarkerOptions, float_rows, marker_import, read_text
 from ..units import conversion
 
 
+class TrcOptions(MarkerOptions, frozen=True, kw_only=True):
+    """Which way is up.
+
+    Attributes
+    ----------
+    y_up : bool
+        The file's y is up, as OpenSim has it: turned so that z is.
+    """
+
+    y_up: Annotated[bool, msgspec.Meta(description="y is up in the file: turn it so that z is")] = False
+
+
 class Trc:
     """Importer ``trc``: ``/reference/markers``."""
 
     name: ClassVar[str] = "trc"
     title: ClassVar[str] = "TRC marker trajectories (Motion Analysis, OpenSim)"
-    Options = MarkerOptions
+    Options = TrcOptions
     beside: ClassVar[bool] = True
 
     def sniff(self, head: bytes, path: Path) -> float:
         """Its first word."""
         return 1.0 if head.removeprefix(b"\xef\xbb\xbf").startswith(b"PathFileType") else 0.0
 
-    def read(self, paths: Sequence[Path], options: MarkerOptions) -> Import:
+    def read(self, paths: Sequence[Path], options: TrcOptions) -> Import:
         """Read one file."""
         path = paths[0]
         lines = read_text(path).split("\n")
@@ -64,5 +77,7 @@ class Trc:
             values, rows = values[~timeless], rows[~timeless]
         t_ns = np.rint(values[:, 1] * 1e9).astype(np.int64)
         pos = values[:, 2:].reshape(len(values), -1, 3) * factor
+        if options.y_up:
+            pos = pos[..., [0, 2, 1]] * np.array([1.0, -1.0, 1.0])
         device = {"time": "column Time (s)", "rate_hz": facts.get("DataRate", "")}
         return marker_import(t_ns, rows, names, pos, report, device, options)

@@ -1,4 +1,4 @@
-"""Annotations from tables: BIDS ``events.tsv`` and any other of text with the same columns."""
+"""Annotations from tables of text: BIDS ``events.tsv`` and any other with the same columns."""
 
 from __future__ import annotations
 
@@ -8,13 +8,10 @@ from pathlib import Path
 import msgspec
 import polars as pl
 
-from ..recording.annotations import COLUMNS as ANNOTATIONS
-from ..recording.annotations import FIELDS
-from ..recording.errors import MarchaError
-from ..recording.events import COLUMNS, events_text, sidecar, to_events
-from ..recording.files import read_small
-
-__all__ = ["ANNOTATIONS", "COLUMNS", "events_text", "read_events", "sidecar", "to_events"]
+from .annotations import COLUMNS as ANNOTATIONS
+from .annotations import FIELDS
+from .errors import MarchaError
+from .files import read_small
 
 _MOST_NS = 2**62
 
