@@ -39,11 +39,11 @@ _KNOWN_AT = "t_log_ns"
 Floats = NDArray[np.float64]
 
 
-class BidsOptions(CommonOptions, frozen=True, kw_only=True):
+class BidsImportOptions(CommonOptions, frozen=True, kw_only=True):
     """Nothing of its own."""
 
 
-class Column(NamedTuple):
+class TableColumn(NamedTuple):
     """Where a column of a channel lies in the table: value · factor + offset."""
 
     place: int
@@ -57,7 +57,7 @@ class Bids:
 
     name: ClassVar[str] = "bids"
     title: ClassVar[str] = "Motion-BIDS: the tracking systems of one recording, with events and derivatives"
-    Options = BidsOptions
+    Options = BidsImportOptions
     joins: ClassVar[bool] = True
 
     def sniff(self, head: bytes, path: Path) -> float:
@@ -73,7 +73,7 @@ class Bids:
         """Return the first tracking system of the recording that a table belongs to; raw before derivatives."""
         return _tables(path)[0]
 
-    def read(self, paths: Sequence[Path], options: BidsOptions) -> Import:
+    def read(self, paths: Sequence[Path], options: BidsImportOptions) -> Import:
         """Read all tracking systems of one recording."""
         for path in paths:
             if not _NAME.fullmatch(path.name):
@@ -325,14 +325,14 @@ def _instant(path: Path, text: str) -> int:
     return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
 
 
-def _own_fields(stated: Sequence[Sequence[str]]) -> dict[str, dict[str, Column]]:
-    fields: dict[str, dict[str, Column]] = {}
+def _own_fields(stated: Sequence[Sequence[str]]) -> dict[str, dict[str, TableColumn]]:
+    fields: dict[str, dict[str, TableColumn]] = {}
     for k, (_, topic, column, dtype) in enumerate(stated, 1):
-        fields.setdefault(topic, {})[column] = Column(k, dtype=dtype)
+        fields.setdefault(topic, {})[column] = TableColumn(k, dtype=dtype)
     return fields
 
 
-def _own_specs(fields: dict[str, dict[str, Column]], channels: dict[str, Any]) -> list[ChannelSpec]:
+def _own_specs(fields: dict[str, dict[str, TableColumn]], channels: dict[str, Any]) -> list[ChannelSpec]:
     """Return the channels that were exported; one that lost its columns of text becomes named values."""
     specs = []
     for topic, columns in fields.items():
@@ -349,13 +349,15 @@ def _own_specs(fields: dict[str, dict[str, Column]], channels: dict[str, Any]) -
     return specs
 
 
-def _generic(path: Path, channels: pl.DataFrame) -> tuple[list[ChannelSpec], dict[str, dict[str, Column]]]:
+def _generic(
+    path: Path, channels: pl.DataFrame
+) -> tuple[list[ChannelSpec], dict[str, dict[str, TableColumn]]]:
     """Return the channels of another maker's table by type, component and tracked point."""
     match = _NAME.fullmatch(path.name)
     system = match["system"] if match else "motion"
     inertial = channels["type"].is_in(["ACCEL", "GYRO", "MAGN"]).any()
-    points: dict[str, dict[str, Column]] = {}
-    joints: dict[str, Column] = {}
+    points: dict[str, dict[str, TableColumn]] = {}
+    joints: dict[str, TableColumn] = {}
     frames: dict[str, str] = {}
     for k, row in enumerate(channels.iter_rows(named=True)):
         if row["type"] == "LATENCY":
@@ -368,11 +370,11 @@ def _generic(path: Path, channels: pl.DataFrame) -> tuple[list[ChannelSpec], dic
             where = _beside(path, "channels.tsv")
             raise MarchaError(f"{where}, line {k + 2}: {row['name']}: {error}") from None
         if row["type"] == "JNTANG":
-            joints[row["name"]] = Column(k, factor, offset)
+            joints[row["name"]] = TableColumn(k, factor, offset)
             continue
         columns = points.setdefault(point, {})
         name = row["name"] if column is None or column in columns else column
-        columns[name] = Column(k, factor, offset)
+        columns[name] = TableColumn(k, factor, offset)
         frames.setdefault(point, row["reference_frame"].replace("n/a", ""))
     specs, fields = [], {}
     for point, columns in points.items():
