@@ -19,7 +19,6 @@ from marcha.recording.schemas import SCHEMAS
 from marcha.viz import registry
 from marcha.viz.canvas import Times
 from marcha.viz.registry import available_views
-from marcha.viz.scene import overlap_levels
 from marcha.viz.text import printable
 from marcha.viz.views import View
 
@@ -175,18 +174,6 @@ def test_an_instant_is_a_point_and_no_state(tmp_path: Path) -> None:
     t_ns, _ = column(path, "/annotation/t/instants", "Scalars:scalars")
     assert (t_ns // 10**9).tolist() == [3, 4]
     assert "/annotation/t" not in entities(path)
-
-
-def test_no_lane_holds_two_intervals_at_once() -> None:
-    rng = np.random.default_rng(5)
-    start = np.sort(rng.integers(0, 1000, 200))
-    end = start + rng.integers(1, 80, 200)
-    levels = overlap_levels(start, end)
-    deepest = max(int(np.sum((start <= t) & (end > t))) for t in range(1100))
-    assert levels.max() + 1 == deepest  # no more lanes than needed
-    for level in range(deepest):
-        mine = levels == level
-        assert (start[mine][1:] >= end[mine][:-1]).all()
 
 
 # -- plug-ins ----------------------------------------------------------------------------------------

@@ -11,20 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 
-import numpy as np
 import polars as pl
 import rerun as rr
 
 from . import style
+from .annotation_lanes import AnnotationLanes
 from .canvas import (
     ALIGNMENT,
     COMPARE,
-    OVERVIEW,
     REPORT,
     Canvas,
     ChannelLike,
-    Times,
-    entity,
 )
 from .registry import views_of, warn
 from .timeaxis import TimeAxis
@@ -49,6 +46,8 @@ class Scene:
     ----------
     canvas : Canvas
         Where everything is drawn.
+    lanes : AnnotationLanes
+        Annotations that are drawn.
     views : dict of str to list of View
         The views of each topic.
     """
@@ -65,6 +64,7 @@ class Scene:
         attachments: Mapping[str, Callable[[], bytes]] | None = None,
     ) -> None:
         self.canvas = Canvas(stream, channels, axis, prefix, first_color, alignment, metadata, attachments)
+        self.lanes = AnnotationLanes(self.canvas)
         self.views = {c.topic: views_of(self.canvas, c) for c in self.canvas.channels}
         self._failed: set[View] = set()
 
@@ -97,46 +97,13 @@ class Scene:
         """Draw annotations (``tier, start_ns, end_ns, label``): intervals as lanes, instants as points, and
         a line in the log for each.
 
-        Intervals of a tier that overlap get a lane each level. Stances and steps that a replay wrote are left
-        out: the run's own channels show them.
+        Intervals of a tier that overlap get a lane each. Stances and steps that a replay wrote are left out: the
+        run's own channels show them.
         """
-        canvas = self.canvas
-        for number, ((tier,), rows) in enumerate(annotations.group_by("tier", maintain_order=True)):
-            tier = str(tier)
-            if tier.rpartition("/")[0] in canvas.runs:
-                continue
-            path = f"{canvas.prefix}/annotation/{entity(tier)}"
-            rows = rows.sort("start_ns", maintain_order=True)
-            start, end = rows["start_ns"].to_numpy(), rows["end_ns"].to_numpy()
-            labels = rows["label"].to_list()
-            lasting = np.flatnonzero(end > start)
-            levels = overlap_levels(start[lasting], end[lasting])
-            for level in range(int(levels.max(initial=-1)) + 1):
-                lane = path if level == 0 else f"{path}/overlap{level + 1}"
-                chosen = lasting[levels == level]
-                self._lane(lane, start[chosen], end[chosen], [labels[i] for i in chosen])
-                canvas.show("lanes", lane, tab=OVERVIEW, panel="lanes", owner=tier, alone=True)
-            instants = np.flatnonzero(end <= start)
-            if instants.size:
-                points = f"{path}/instants"
-                canvas.points(points, tier, style.run_color(number), "diamond", 5.0)
-                canvas.scalars(points, start[instants], np.full(instants.size, float(number + 1)))
-                canvas.show("plot", points, tab=OVERVIEW, panel="events (a row a tier)", owner=tier)
-            log = f"{canvas.prefix}/log/annotation/{entity(tier)}"
-            text = [
-                f"{tier}: {label}" + (f", {(b - a) / 1e9:.2f} s" if b > a else "")
-                for label, a, b in zip(labels, start, end, strict=True)
-            ]
-            canvas.text(log, start, text)
-            canvas.show("log", log, tab=REPORT, panel="steps and annotations", owner=tier)
-
-    def _lane(self, path: str, start: Times, end: Times, labels: list[str]) -> None:
-        # an interval that another one follows at once needs no gap between them
-        gap = np.flatnonzero(~np.isin(end, start))
-        times = np.concatenate([start, end[gap]])
-        states = [*(label or "(no label)" for label in labels), *[""] * len(gap)]
-        order = np.argsort(times, kind="stable")
-        self.canvas.states(path, times[order], [states[i] for i in order])
+        rows = annotations.select("id", "tier", "start_ns", "end_ns", "label").to_dicts()
+        self.lanes.update(rows)
+        self.lanes.log(rows)
+        self.lanes.show_drawn()
 
     def end(self) -> None:
         """Draw what needs the whole: tracks, thresholds, errors against the reference."""
@@ -188,17 +155,3 @@ class Scene:
                 views[0].begin()
                 if step == View.draw.__name__:
                     views[0].draw(*arguments)  # type: ignore[arg-type]
-
-
-def overlap_levels(start: Times, end: Times) -> Times:
-    """Return for intervals, sorted by their start, the first lane (n,) that is free when they begin."""
-    levels = np.zeros(len(start), dtype=np.int64)
-    free: list[int] = []  # when each lane is free again
-    for i, (a, b) in enumerate(zip(start.tolist(), end.tolist(), strict=True)):
-        level = next((k for k, until in enumerate(free) if until <= a), len(free))
-        if level == len(free):
-            free.append(b)
-        else:
-            free[level] = b
-        levels[i] = level
-    return levels
