@@ -43,13 +43,14 @@ def by_eye(
     /,
     *,
     page: Annotated[bool, Parameter(name="--page", negative="")] = False,
+    show: Annotated[bool, Parameter(name="--show", negative="")] = False,
     browser: Annotated[bool, Parameter(name="--browser", negative="--no-browser")] = True,
     video: Path | None = None,
     video_offset: Annotated[float, Parameter(name="--video-offset", allow_leading_hyphen=True)] = 0.0,
     where: Where = WHERE,
     common: Common = DEFAULT,
 ) -> Outcome:
-    """Annotate by eye, in a page of this machine's browser.
+    """Annotate by eye: in a page of this machine's browser, or in the native Rerun viewer.
 
     Parameters
     ----------
@@ -57,6 +58,9 @@ def by_eye(
         The recording.
     page : bool
         Open the page: signals, annotations, the film of the walk; by mouse or by keyboard alone.
+    show : bool
+        Open the viewer: ranges are dragged on its time ruler, or the cursor is put; keys and labels are typed
+        in this terminal.
     browser : bool
         Open a browser window; without it the address is only printed.
     video : Path
@@ -66,23 +70,31 @@ def by_eye(
     """
     from .. import recording
     from ..recording.errors import UsageError
-    from ..viz.annotating import annotate_page
-    from ..viz.annotating.session import Session
+    from ..viz.annotating import Session, annotate_in_viewer, annotate_page
 
-    if not page:
-        raise UsageError(f"annotate {path}: give --page to mark by eye, or a command: marcha annotate --help")
+    if page == show:
+        raise UsageError(
+            f"annotate {path}: give --page or --show to mark by eye, or a command: marcha annotate --help"
+        )
     rec = recording.open(path)
     say_losses(rec)
-    session = Session(rec, where.target(rec), action="page", **where.how)
+    session = Session(rec, where.target(rec), action="page" if page else "viewer", **where.how)
     if session.taken_up:
         complain(f"took up {session.taken_up} edits of an earlier session from {session.draft}")
-    annotate_page(
-        session,
-        video=video,
-        video_offset_s=video_offset,
-        open_browser=browser,
-        opened=lambda server: complain(f"the page is at {server.address}; Ctrl-C ends it"),
-    )
+    if page:
+        annotate_page(
+            session,
+            video=video,
+            video_offset_s=video_offset,
+            open_browser=browser,
+            opened=lambda server: complain(f"the page is at {server.address}; Ctrl-C ends it"),
+        )
+    else:
+        annotate_in_viewer(
+            session,
+            say=complain,
+            opened=lambda window: complain(f"the viewer is at {window.address}"),
+        )
     left = session.unsaved
     if left:
         complain(f"{left} annotations are not saved; {session.draft} keeps them for the next session")

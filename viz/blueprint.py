@@ -38,7 +38,7 @@ GRID_PLOTS = 4
 Part = rrb.View | rrb.Container
 
 
-def blueprint(canvases: Sequence[Canvas], *, live: bool = False) -> rrb.Blueprint:
+def blueprint(canvases: Sequence[Canvas], *, live: bool = False, ruler: bool = False) -> rrb.Blueprint:
     """Return the blueprint of recordings that share one view.
 
     Parameters
@@ -47,6 +47,8 @@ def blueprint(canvases: Sequence[Canvas], *, live: bool = False) -> rrb.Blueprin
         Begun (live) or drawn (saved): extents and lengths are known only then.
     live : bool
         Whether data still comes: the cursor follows it.
+    ruler : bool
+        Whether the time panel is open, so that ranges can be dragged on its ruler.
     """
     entries = [e for c in canvases for e in c.entries]
     tabs = [_tab(name, canvases, entries) for name in tab_names(entries)]
@@ -55,7 +57,11 @@ def blueprint(canvases: Sequence[Canvas], *, live: bool = False) -> rrb.Blueprin
         root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=SINCE_START, play_state="following" if live else "paused"),
+        rrb.TimePanel(
+            state="expanded" if ruler else "collapsed",
+            timeline=SINCE_START,
+            play_state="following" if live else "paused",
+        ),
         auto_layout=False,
         auto_views=False,
     )

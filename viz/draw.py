@@ -22,6 +22,8 @@ def draw(
     recs: Sequence[Recording],
     stream: rr.RecordingStream,
     selection: Selection | None = None,
+    *,
+    annotating: bool = False,
 ) -> list[Scene]:
     """Log recordings, their reports and the blueprint into a stream that has its sinks.
 
@@ -33,6 +35,8 @@ def draw(
         Where to log.
     selection : Selection, optional
         Topics and range of log times; everything by default.
+    annotating : bool
+        Whether annotations are to come: panels for them are there, and the time panel is open.
 
     Returns
     -------
@@ -59,13 +63,15 @@ def draw(
             for topic, table in window.tables.items():
                 scene.write(topic, table)
         scene.annotate(within(rec.annotations, selection))
+        if annotating:
+            scene.lanes.show()
         scene.end()
         text = rr.TextDocument(report(rec), media_type=rr.MediaType.MARKDOWN)
         scene.canvas.static(f"{scene.canvas.prefix}/report", text)
         scenes.append(scene)
     canvases = [scene.canvas for scene in scenes]
     log_top_view(stream, *extent(canvases))
-    send_blueprint(stream, blueprint(canvases))
+    send_blueprint(stream, blueprint(canvases, ruler=annotating))
     return scenes
 
 

@@ -75,7 +75,7 @@ def screenshots(
     with viewer.native(headless=True, size=size) as process:
         client = ViewerClient.connect(viewer.uri(process.port))
         client.open(str(path))
-        state = _loaded(client, path, patience_s)
+        state = loaded(client, path, patience_s)
         line = next(t for t in state.recordings[0].timelines if t.name == SINCE_START)
         start, end = line.start or 0, line.end or 0
         cursor = start + round((end - start) * at)
@@ -93,7 +93,7 @@ def screenshots(
         return pictures
 
 
-def _loaded(client: Any, path: Path, patience_s: float) -> Any:
+def loaded(client: Any, path: Path, patience_s: float) -> Any:
     """Return the viewer's state once everything has been read."""
     until = time.monotonic() + patience_s
     while time.monotonic() < until:

@@ -4,5 +4,7 @@ Both edit a :class:`~marcha.viz.annotating.session.Session`.
 """
 
 from .page import annotate_page
+from .session import Session
+from .viewer import annotate_in_viewer
 
-__all__ = ["annotate_page"]
+__all__ = ["Session", "annotate_in_viewer", "annotate_page"]
