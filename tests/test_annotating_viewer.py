@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -175,6 +176,11 @@ def display() -> Iterator[str]:
     server.wait()
 
 
+def typed(stream: IO[str], keys: str) -> None:
+    stream.write(keys)
+    stream.flush()
+
+
 def heard(stream: IO[str], words: str) -> str:
     """Return the next line of a program that contains words."""
     for line in stream:
@@ -199,28 +205,30 @@ def test_a_range_dragged_with_a_real_mouse_is_marked_shown_undone_and_saved(
         stderr=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
-        bufsize=1,
     )
     assert program.stdin is not None
     assert program.stderr is not None
+    late = threading.Timer(120.0, program.kill)  # nothing below waits for ever
+    late.start()
     try:
         address = heard(program.stderr, "the viewer is at").split()[-1]
         heard(program.stderr, "leave;")
         client = ViewerClient.connect(address)
         marked = _dragged(client)
         assert marked is not None, "no drag on the ruler selected a range"
-        program.stdin.write("\n")
+        typed(program.stdin, "\n")
         said = heard(program.stderr, "marked manual: 'mark'")
         assert f"{marked[0] / 1e9:.3f} s to {marked[1] / 1e9:.3f} s" in said
-        program.stdin.write("lbad stretch\n")
+        typed(program.stdin, "lbad stretch\n")
         heard(program.stderr, "marked manual: 'bad stretch'")
-        program.stdin.write("us")
+        typed(program.stdin, "us")
         heard(program.stderr, "undo: - manual: 'bad stretch'")
         heard(program.stderr, "saved")
         assert [v.name for v in client.get_state().views if v.reports] == []
-        program.stdin.write("q")
+        typed(program.stdin, "q")
         assert program.wait(timeout=30) == 0
     finally:
+        late.cancel()
         program.kill()
         program.wait()
     (row,) = mr.open(out).annotations.to_dicts()
