@@ -17,7 +17,7 @@ from marcha.recording import MarchaError
 from marcha.recording.changes import change
 from marcha.recording.events import Vocabulary
 from marcha.viz.annotating.session import Edit, Session
-from marcha.viz.annotating.viewer import Marker, TimePanel, read_time_panel
+from marcha.viz.annotating.viewer import KeyMarking, TimePanel, read_time_panel
 from marcha.viz.timeaxis import SINCE_START, UTC, TimeAxis
 
 from .annotation_samples import SPAN_NS, START_NS, recording
@@ -40,7 +40,7 @@ class Screen:
         self.said: list[str] = []
         self.edits: list[Edit] = []
         self.session = Session(mr.open(path), path, by="eva", overwrite=True, action="viewer")
-        self.marker = Marker(
+        self.marker = KeyMarking(
             self.session,
             lambda: TimePanel(self.cursor, self.range),
             self.edits.append,

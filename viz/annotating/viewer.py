@@ -79,7 +79,7 @@ def read_time_panel(client: Any, axis: TimeAxis) -> TimePanel:
     )
 
 
-class Marker:
+class KeyMarking:
     """Marks by single keys.
 
     Parameters
@@ -299,7 +299,7 @@ def _mark(
         say(line)
     with Keys(say) as keys:
         axis = scene.canvas.axis
-        marker = Marker(session, lambda: read_time_panel(client, axis), shown, keys.line, say)
+        marker = KeyMarking(session, lambda: read_time_panel(client, axis), shown, keys.line, say)
         while window.running:
             key = keys.next()
             if key is not None and not marker.press(key):
