@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -196,8 +196,17 @@ def evaluate(
     for run in runs or ():
         if run not in lineages:
             raise UsageError(f"{rec.path}: no run {run}; there are {', '.join(lineages)}")
-    views = [
-        recording_view(
+    chosen = {run: lineage for run, lineage in lineages.items() if runs is None or run in runs}
+    marks = rec.annotations if annotations is None else annotations
+    if by is not None and not marks["tier"].is_in([by, *(f"{run}/{by}" for run in chosen)]).any():
+        raise UsageError(
+            f"{rec.path}: no tier {by!r}; there are {', '.join(marks['tier'].unique(maintain_order=True)) or 'none'} "
+            "(`marcha annotate rules` adds turns, stairs and the like)"
+        )
+    marked = _intervals(marks, lineages) if intervals else pl.DataFrame()
+    measured = []
+    for run, lineage in chosen.items():  # one at a time: each holds its track
+        view = recording_view(
             rec,
             {"run": run, **lineage},
             None,
@@ -207,17 +216,8 @@ def evaluate(
             truth=truth,
             survey=survey,
         )
-        for run, lineage in lineages.items()
-        if runs is None or run in runs
-    ]
-    marks = rec.annotations if annotations is None else annotations
-    if by is not None and not marks["tier"].is_in([by, *(f"{v.run}/{by}" for v in views)]).any():
-        raise UsageError(
-            f"{rec.path}: no tier {by!r}; there are {', '.join(marks['tier'].unique(maintain_order=True)) or 'none'} "
-            "(`marcha annotate rules` adds turns, stairs and the like)"
-        )
-    marked = _intervals(marks, lineages) if intervals else pl.DataFrame()
-    return Evaluation([evaluate_run(v, marked, _tier(marks, v.run, by) if by else None) for v in views])
+        measured.append(evaluate_run(view, marked, _tier(marks, run, by) if by else None))
+    return Evaluation(measured)
 
 
 def recording_view(
@@ -261,6 +261,12 @@ def recording_view(
             return rec.table(topic)
         return pl.concat([_some(w.tables[topic], columns) for w in rec.windows([topic])])
 
+    def stream(name: str) -> tuple[int, Iterator[pl.DataFrame]] | None:
+        topic = f"/estimate/{run}/{name}"
+        if rec is None or topic not in rec.channels:
+            return None
+        return rec.channels[topic].count, (w.tables[topic] for w in rec.windows([topic]))
+
     start_ns = start_ns if start_ns is not None else _number(lineage.get("range.start_ns"))
     end_ns = end_ns if end_ns is not None else _number(lineage.get("range.end_ns"))
     whole = start_ns is None and end_ns is None
@@ -281,6 +287,7 @@ def recording_view(
         max_gap_s=max_gap_s,
         reference_frame=rec.channels[track].frame_id if rec is not None and track is not None else "",
         survey=None if survey is None else _surveyed(survey),
+        stream=stream if tables is None else None,
     )
 
 

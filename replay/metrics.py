@@ -118,8 +118,11 @@ def reference(view: RunView) -> dict[str, float]:
 
 def _velocity_error(view: RunView, transform: Transform) -> tuple[IntArray, FloatArray] | None:
     """Return stamps and velocity errors in the reference's frame where both have velocities."""
-    table, reference = view.table("velocity"), view.reference_velocity
-    if table is None or reference is None or table.is_empty() or reference.is_empty():
+    reference = view.reference_velocity
+    if reference is None or reference.is_empty():
+        return None
+    table = view.table("velocity")
+    if table is None or table.is_empty():
         return None
     reference = reference.unique("t_ns", keep="first", maintain_order=True)
     t_ns = table["t_ns"].to_numpy()
@@ -137,10 +140,9 @@ def consistency(view: RunView) -> dict[str, float]:
     certainty there; a fitted alignment would take part of the error away. Samples whose sigma is still 0 are
     left out.
     """
-    sigma = view.table("sigma")
     compared = view.compared("origin-yaw")
-    if sigma is None or compared is None or not compared.on_estimate:
-        return {}
+    if compared is None or not compared.on_estimate or (sigma := view.table("sigma")) is None:
+        return {}  # a table of standard deviations is large: it is read where it is needed
     found = _normalized(sigma, "pos", "position", compared.t_ns, compared.error @ compared.transform.rotation)
     velocity = _velocity_error(view, compared.transform)
     if velocity is not None:

@@ -189,11 +189,11 @@ def _consistency(error: FloatArray, cov: FloatArray) -> dict[str, float]:
 
 def waypoint_ellipse(view: RunView) -> dict[str, float]:
     """Share of surveyed points inside the 95 % ellipse of a track that is laid on the first of them."""
-    sigma = view.table("sigma")
-    if sigma is None or not {"sigma_pos_x", "sigma_pos_y"} <= set(sigma.columns):
-        return {}
     compared = view.compared("origin")
     if compared is None or compared.on_estimate or len(compared.t_ns) < 2:
+        return {}
+    sigma = view.table("sigma")
+    if sigma is None or not {"sigma_pos_x", "sigma_pos_y"} <= set(sigma.columns):
         return {}
     cov = _stated(sigma, view.table("state"), ("sigma_pos_x", "sigma_pos_y"))
     at = np.searchsorted(sigma["t_ns"].to_numpy(), compared.t_ns, "right") - 1

@@ -7,7 +7,7 @@ over parts that make up the walk is what the whole says.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -30,6 +30,7 @@ PLAN = "plan"
 REST_NS = 500_000_000
 """How long beyond what was recorded a walker is taken to stay where he was."""
 Loader = Callable[[str, "Sequence[str] | None"], "pl.DataFrame | None"]
+Stream = Callable[[str], "tuple[int, Iterator[pl.DataFrame]] | None"]
 
 
 def joined(spans: IntArray) -> IntArray:
@@ -72,6 +73,14 @@ class Trajectory:
     def __len__(self) -> int:
         return len(self.t_ns)
 
+    def within(self, spans: IntArray) -> Trajectory | None:
+        """Return what lies in stretches of time; None where nothing does."""
+        keep = inside(self.t_ns, spans)
+        if not keep.any():
+            return None
+        quat = None if self.quat_wxyz is None else self.quat_wxyz[keep]
+        return Trajectory(self.t_ns[keep], self.position[keep], quat)
+
     @cached_property
     def yaw(self) -> FloatArray | None:
         """Heading in radians, shape (n,)."""
@@ -93,6 +102,32 @@ def track_of(table: pl.DataFrame | None) -> Trajectory | None:
     if quat is not None and not np.isfinite(quat).all():
         quat = None
     return Trajectory(table["t_ns"].to_numpy(), table.select(POSITION).to_numpy(order="c"), quat)
+
+
+def track_of_stream(rows: int, tables: Iterator[pl.DataFrame], headings: bool) -> Trajectory | None:
+    """Return what :func:`track_of` returns of pieces of a pose table, without having the table in memory.
+
+    None also where the pieces are not in order.
+    """
+    names = (*POSITION, *QUATERNION) if headings else POSITION
+    t_ns, values = np.empty(rows, np.int64), np.empty((rows, len(names)))
+    n = 0
+    for table in tables:
+        if not set(POSITION) <= set(table.columns):
+            return None
+        if headings and not set(QUATERNION) <= set(table.columns):
+            names, values, headings = POSITION, np.ascontiguousarray(values[:, :3]), False
+        columns = [table[name].to_numpy() for name in names]
+        good = np.logical_and.reduce([np.isfinite(c) for c in columns[:3]])
+        end = min(rows, n + int(np.count_nonzero(good)))
+        t_ns[n:end] = table["t_ns"].to_numpy()[good][: end - n]
+        for k, column in enumerate(columns):
+            values[n:end, k] = column[good][: end - n]
+        n = end
+    if not n or not (np.diff(t_ns[:n]) > 0).all():
+        return None
+    quat = values[:n, 3:] if headings and np.isfinite(values[:n, 3:]).all() else None
+    return Trajectory(t_ns[:n], values[:n, :3], quat)
 
 
 @dataclass(frozen=True)
@@ -186,6 +221,9 @@ class RunView:
     output : callable
         ``output("pose", columns)`` is the table of that output with ``t_ns`` and those of ``columns``
         (None: all) that it has; None where the run does not have the output.
+    stream : callable, optional
+        ``stream("pose")`` is the number of rows of that output and an iterator over its pieces: with it a track
+        is read without its table, so that a day of walking fits into memory.
     truth : Truth
         What is known of the walk.
     reference, reference_velocity : polars.DataFrame or None
@@ -224,6 +262,7 @@ class RunView:
     whole: RunView | None = None
     reference_frame: str = ""
     survey: pl.DataFrame | None = None
+    stream: Stream | None = None
     _cache: dict[Any, pl.DataFrame | None] = field(default_factory=dict, repr=False)
     _comparisons: dict[str, Comparison | None] = field(default_factory=dict, repr=False)
 
@@ -232,6 +271,10 @@ class RunView:
         if (name, columns) not in self._cache:
             self._cache[name, columns] = self.output(name, columns)
         return self._within(self._cache[name, columns])
+
+    def has(self, name: str) -> bool:
+        """Whether the run has an output, without reading it."""
+        return self.stream(name) is not None if self.stream is not None else self.table(name) is not None
 
     @property
     def inputs(self) -> dict[str, tuple[str, ...]]:
@@ -318,6 +361,13 @@ class RunView:
     def track(self) -> Trajectory | None:
         """The estimated track: of the output ``pose``, else of ``position``."""
         headings = QUATERNION if self.reference is not None else ()
+        if self.whole is not None and self.whole.stream is not None and self.spans is not None:
+            whole = self.whole.track
+            return None if whole is None else whole.within(self.spans)
+        if self.stream is not None and (found := self.stream("pose")) is not None:
+            track = track_of_stream(*found, bool(headings))
+            if track is not None:
+                return track
         track = track_of(self.table("pose", (*POSITION, *headings)))
         return track if track is not None else track_of(self.table("position", POSITION))
 
@@ -343,13 +393,31 @@ class RunView:
     @cached_property
     def stances(self) -> IntArray:
         """Stances as ``[first still, last still]`` times, shape (n, 2)."""
+        if self.whole is None and self.stream is not None and (found := self.stream("stance")) is not None:
+            return _stances(found[1])
         table = self.table("stance")
-        if table is None or table.is_empty():
-            return np.empty((0, 2), np.int64)
+        return _stances(iter(() if table is None else (table,)))
+
+
+def _stances(tables: Iterator[pl.DataFrame]) -> IntArray:
+    """Return first and last still time of every stance, from pieces of the output ``stance`` in order."""
+    first: list[IntArray] = []
+    last: list[IntArray] = []
+    before, before_ns = 0, 0
+    for table in tables:
+        if table.is_empty():
+            continue
         t_ns, still = table["t_ns"].to_numpy(), table["still"].cast(pl.Int8).to_numpy()
-        edges = np.diff(still, prepend=np.int8(0), append=np.int8(0))
-        first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-        return np.column_stack((t_ns[first], t_ns[last]))
+        edges = np.diff(still, prepend=np.int8(before))
+        ends = np.flatnonzero(edges == -1)
+        first.append(t_ns[edges == 1])
+        last.append(np.where(ends > 0, t_ns[ends - 1], before_ns))
+        before, before_ns = int(still[-1]), int(t_ns[-1])
+    if before:
+        last.append(np.array([before_ns], np.int64))
+    if not first:
+        return np.empty((0, 2), np.int64)
+    return np.column_stack((np.concatenate(first), np.concatenate(last)))
 
 
 def with_stays(reference: Trajectory, max_gap_s: float) -> Trajectory:
