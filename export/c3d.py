@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -12,6 +10,7 @@ import numpy as np
 
 from ..recording import Recording
 from ..recording.errors import UsageError
+from ..recording.scratch import scratch_folder
 from ..recording.selection import Selection, selected_topics, within
 from .facts import origin, pretty
 from .files import write_files
@@ -151,10 +150,9 @@ def _encode(
         file.add_parameter("EVENT", "CONTEXTS", [c for _, c, _ in events])
         file.add_parameter("EVENT", "LABELS", [label for _, _, label in events])
         file.add_parameter("EVENT", "TIMES", times)
-    with tempfile.TemporaryDirectory() as folder:
-        target = os.path.join(folder, "x.c3d")
-        file.write(target)
-        return Path(target).read_bytes()
+    with scratch_folder() as folder:
+        file.write(str(folder / "x.c3d"))
+        return (folder / "x.c3d").read_bytes()
 
 
 def _events(marks: Any, zero_ns: int) -> list[tuple[float, str, str]]:

@@ -10,6 +10,7 @@ from glob import escape
 from pathlib import Path
 
 from ..recording.errors import MarchaError, OutputExists
+from ..recording.scratch import alive
 
 MARKER = "channels.json"
 """File that makes a folder an export of tables, which may be replaced when the user says so."""
@@ -119,24 +120,12 @@ def _remove_leftovers(path: Path) -> None:
     for kind in ("part", "old"):
         for left in path.parent.glob(f".{escape(path.name)}.*.{kind}"):
             number = left.name.removesuffix(f".{kind}").rpartition(".")[2].partition("-")[0]
-            if not number.isdigit() or _alive(int(number)):
+            if not number.isdigit() or alive(int(number)):
                 continue
             if kind == "old" and not path.exists():
                 left.rename(path)  # killed between the two renames: the earlier export is the only one
             else:
                 shutil.rmtree(left, ignore_errors=True)
-
-
-def _alive(process: int) -> bool:
-    if os.name != "posix":
-        return True  # elsewhere signal 0 is not a question
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True
 
 
 def _flush(path: Path) -> None:

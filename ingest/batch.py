@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from ..recording.errors import MarchaError
+from ..recording.scratch import scratch_folder
 from . import registry
 from .archive import UNPACK_LIMIT_GB, is_zip, unpack
 
@@ -75,7 +75,7 @@ def logs(
             raise MarchaError(f"{path}: no such file or folder")
         folder = path
         if path.is_file() and is_zip(path):
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="marcha-")))
+            folder = stack.enter_context(scratch_folder())
             unpack(path, folder, unpack_limit_gb)
             archives[folder] = path
         if not folder.is_dir() or _names(folder, format):

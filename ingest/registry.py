@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -15,6 +14,7 @@ import msgspec
 
 from ..recording.errors import MarchaError, UsageError
 from ..recording.files import require_regular
+from ..recording.scratch import scratch_folder
 from .archive import UNPACK_LIMIT_GB, is_zip, unpack
 from .contract import HEAD_BYTES, CommonOptions, Importer
 from .truth import is_side_file
@@ -356,7 +356,7 @@ def _head(path: Path) -> bytes:
 
 
 def _unpack(path: Path, stack: contextlib.ExitStack, limit_gb: float) -> Path:
-    folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="marcha-")))
+    folder = stack.enter_context(scratch_folder())
     unpack(path, folder, limit_gb)
     return folder
 

@@ -66,6 +66,10 @@ def qos_profile(topic: str) -> str:
     return _QOS.format(durability="transient_local" if topic == "/tf_static" else "volatile")
 
 
+EVENT_ROWS = 16384
+"""Annotations that are encoded together: their texts take a kilobyte each while they are."""
+
+
 @dataclass
 class _Output:
     """One channel being written; ``encoder`` is there once the columns are known."""
@@ -449,15 +453,19 @@ class Writer:
             self._file.add_channel(
                 Channel(id_, topic, "cdr", {"offered_qos_profiles": qos_profile(topic)}, schema)
             )
-            data, index = encode_events(rows.sort("start_ns", maintain_order=True), id_)
-            ends = np.append(index[1:, 1], data.size)
-            at = 0
-            while at < len(index):
-                begin = index[at, 1]
-                n = max(1, int(np.searchsorted(ends, begin + CHUNK_SIZE, side="right")) - at)
-                part = index[at : at + n] - (0, begin)
-                self._file.submit(pack, data[begin : ends[at + n - 1]], id_, part, self._level)
-                at += n
+            for piece in rows.sort("start_ns", maintain_order=True).iter_slices(EVENT_ROWS):
+                self._put_events(piece, id_)
+
+    def _put_events(self, rows: pl.DataFrame, id_: int) -> None:
+        data, index = encode_events(rows, id_)
+        ends = np.append(index[1:, 1], data.size)
+        at = 0
+        while at < len(index):
+            begin = index[at, 1]
+            n = max(1, int(np.searchsorted(ends, begin + CHUNK_SIZE, side="right")) - at)
+            part = index[at : at + n] - (0, begin)
+            self._file.submit(pack, data[begin : ends[at + n - 1]], id_, part, self._level)
+            at += n
 
 
 def pack_records(records: Sequence[tuple[int, bytes]], channel_id: int, level: int | None) -> Packed:

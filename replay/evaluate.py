@@ -20,6 +20,11 @@ from .metrics_joint import doubts
 from .references import KINDS, reference_of, references
 from .view import RunView, Truth, joined
 
+NO_MARKS = pl.DataFrame(
+    schema={"tier": pl.String, "start_ns": pl.Int64, "end_ns": pl.Int64, "label": pl.String}
+)
+"""No annotations, where they are not looked at: a day has hundreds of thousands."""
+
 
 class IntervalEvaluation(msgspec.Struct):
     """Metrics of one annotated interval.
@@ -197,7 +202,7 @@ def evaluate(
         if run not in lineages:
             raise UsageError(f"{rec.path}: no run {run}; there are {', '.join(lineages)}")
     chosen = {run: lineage for run, lineage in lineages.items() if runs is None or run in runs}
-    marks = rec.annotations if annotations is None else annotations
+    marks = annotations if annotations is not None else rec.annotations if intervals or by else NO_MARKS
     if by is not None and not marks["tier"].is_in([by, *(f"{run}/{by}" for run in chosen)]).any():
         raise UsageError(
             f"{rec.path}: no tier {by!r}; there are {', '.join(marks['tier'].unique(maintain_order=True)) or 'none'} "

@@ -121,10 +121,12 @@ def track_of_stream(rows: int, tables: Iterator[pl.DataFrame], headings: bool) -
         good = np.logical_and.reduce([np.isfinite(c) for c in columns[:3]])
         end = min(rows, n + int(np.count_nonzero(good)))
         t_ns[n:end] = table["t_ns"].to_numpy()[good][: end - n]
+        if not (np.diff(t_ns[max(0, n - 1) : end]) > 0).all():
+            return None
         for k, column in enumerate(columns):
             values[n:end, k] = column[good][: end - n]
         n = end
-    if not n or not (np.diff(t_ns[:n]) > 0).all():
+    if not n:
         return None
     quat = values[:n, 3:] if headings and np.isfinite(values[:n, 3:]).all() else None
     return Trajectory(t_ns[:n], values[:n, :3], quat)

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import shutil
-import tempfile
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from functools import lru_cache
@@ -24,6 +22,7 @@ from ..export.rules import RULES, by_rules
 from ..recording import MarchaError, OutputExists, Recording, UsageError
 from ..recording import create as create_recording
 from ..recording import open as open_recording
+from ..recording.scratch import scratch_folder
 from ..recording.selection import Selection
 from ..replay.api import replay
 from ..replay.attachment import NOT_RAW
@@ -182,12 +181,9 @@ def _simulate(source: StudyRecording, path: Path) -> None:
     from ..ingest import convert
     from ..ingest.simulate import simulate
 
-    raw = Path(tempfile.mkdtemp(prefix=".walk-", dir=path.parent))
-    try:
+    with scratch_folder(path.parent) as raw:
         walk = simulate(source.scenario, raw, seed=source.seed, **source.options)
         convert(walk.paths, path)
-    finally:
-        shutil.rmtree(raw, ignore_errors=True)
 
 
 def chosen(rec: Recording, inputs: Sequence[str]) -> list[str] | None:
@@ -224,9 +220,9 @@ def _run(rec: Recording, task: StudyTask, jobs: Sequence[Job], topics: list[str]
         for number, job in enumerate(jobs)
     ]
     if task.by:
-        with tempfile.TemporaryDirectory(prefix="marcha-") as folder:
-            result = replay(rec, specs, inputs=topics, out=Path(folder) / "done.mcap")
-            by_label = _by_label(open_recording(Path(folder) / "done.mcap"), task.by)
+        with scratch_folder() as folder:
+            result = replay(rec, specs, inputs=topics, out=folder / "done.mcap")
+            by_label = _by_label(open_recording(folder / "done.mcap"), task.by)
     else:
         result, by_label = replay(rec, specs, inputs=topics), {}
     imported = _import_findings(rec)

@@ -9,15 +9,19 @@ import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from functools import cache
 from typing import Any, TypeVar
 
 from ..recording import MarchaError, UsageError
+from ..recording.scratch import scratch_folder
 from ..recording.threads import LIMIT
 
 T = TypeVar("T")
@@ -75,9 +79,9 @@ class Executor:
     def __enter__(self) -> Executor:
         return self
 
-    def __exit__(self, *error: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         if self._pool is not None:
-            self._pool.shutdown()
+            self._pool.shutdown(now=kind is not None and not issubclass(kind, Exception))
         if self._client is not None:
             self._client.close()
 
@@ -166,8 +170,19 @@ def _attempt(function: Callable[[T], R], task: T) -> R | Exception:
 
 
 def _start_worker() -> None:
-    """Leave Ctrl-C to the parent, which lets running tasks end and keeps their results."""
+    """Leave Ctrl-C to the parent, unwind at SIGTERM, and end when the parent has ended, in whatever way."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        threading.Thread(target=_end_with, args=(parent.sentinel,), daemon=True, name="watch").start()
+
+
+def _end_with(sentinel: int) -> None:
+    from multiprocessing.connection import wait as ready
+
+    ready([sentinel])
+    os._exit(1)
 
 
 def _ready() -> None:
@@ -204,6 +219,7 @@ class WarmPool:
         # once what all workers need, where the system has it.
         served = "forkserver" in multiprocessing.get_all_start_methods()
         context = multiprocessing.get_context("forkserver" if served else "spawn")
+        _place_of_sockets()
         self._pool = ProcessPoolExecutor(count, context, initializer=_start_worker)
         self._count = count
         self._own_server = served and _server_pid() is None
@@ -238,13 +254,39 @@ class WarmPool:
         self._started.result()
         return self._pool.submit(function, *arguments)
 
-    def shutdown(self) -> None:
-        """Wait for the running tasks and end the processes; not for what they are still loading."""
+    def shutdown(self, now: bool = False) -> None:
+        """Wait for the running tasks and end the processes; not for what they are still loading.
+
+        ``now`` gives the running tasks up: they unwind, or are killed after a second.
+        """
+        if now:
+            processes = list((self._pool._processes or {}).values())
+            for process in processes:
+                process.terminate()
+            until = time.monotonic() + 1.0
+            for process in processes:
+                process.join(max(0.0, until - time.monotonic()))
+                process.kill()
         while self._own_server and not self._started.done():
             _stop_server()
             wait([self._started], timeout=0.1)  # a thread that had not asked it yet has started another
         self._started.exception()
         self._pool.shutdown(wait=True, cancel_futures=True)
+
+
+@cache
+def _place_of_sockets() -> None:
+    """Let multiprocessing keep its sockets in a folder that the next process removes if this one is killed."""
+    from multiprocessing import util
+
+    stack = ExitStack()
+    folder, before = stack.enter_context(scratch_folder()), tempfile.tempdir
+    tempfile.tempdir = str(folder)
+    try:
+        util.get_temp_dir()  # it remembers the place
+    finally:
+        tempfile.tempdir = before
+    util.Finalize(None, stack.close, exitpriority=-200)  # behind multiprocessing's own, of -100
 
 
 def _server() -> Any:

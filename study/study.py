@@ -16,6 +16,7 @@ import msgspec
 import polars as pl
 
 from ..recording import MarchaError, OutputExists, UsageError
+from ..recording.scratch import remove_left
 from ..viz.page import PagePicture
 from . import analysis, labels, plan
 from . import config as cfg
@@ -175,7 +176,7 @@ def run_study(
     OutputExists
         Where ``out_dir`` holds something else.
     KeyboardInterrupt
-        After the running tasks have ended; finished cells stay.
+        At once: running tasks are given up, finished cells stay.
     """
     begin = time.perf_counter()
     started = datetime.now(UTC)
@@ -289,6 +290,8 @@ def _take_folder(folder: Path, toml: str, *, overwrite: bool, resume: bool) -> N
                 "with this one "
                 "(cells that both share are kept), or --force to start anew"
             )
+    for part in (folder, folder / "cells", folder / "recordings", folder / "figures"):
+        remove_left(part)
     write_atomic(known, lambda path: path.write_text(toml, encoding="utf-8"))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
@@ -17,6 +16,7 @@ import polars as pl
 
 from ..recording import Recording
 from ..recording.errors import MarchaError, UsageError
+from ..recording.scratch import scratch_folder
 from ..replay.epochs import GAIT
 from ..replay.evaluate import Evaluation, RunEvaluation, evaluate
 from ..replay.metrics import BETWEEN
@@ -325,10 +325,10 @@ def _viewer(html: Html, rec: Recording) -> None:
     from .rrd import write_rrd
     from .screenshot import screenshots
 
-    with tempfile.TemporaryDirectory(prefix="marcha-") as folder:
+    with scratch_folder() as folder:
         try:
-            write_rrd(rec, Path(folder) / "view.rrd")
-            (shot,) = screenshots(Path(folder) / "view.rrd", at=1.0)
+            write_rrd(rec, folder / "view.rrd")
+            (shot,) = screenshots(folder / "view.rrd", at=1.0)
         except MarchaError as error:
             html.text(f"No picture of the viewer: {printable(error)}.", "note")
             return
