@@ -72,9 +72,17 @@ class Layout:
         self._count_at = count_at
         self._library = library
         self._walk("", definition)
-        self.dtype = np.dtype(
-            {"names": self._names, "formats": self._formats, "offsets": self._offsets, "itemsize": self._at}
-        )
+        try:
+            self.dtype = np.dtype(
+                {
+                    "names": self._names,
+                    "formats": self._formats,
+                    "offsets": self._offsets,
+                    "itemsize": self._at,
+                }
+            )
+        except ValueError as error:  # a definition that names a field twice
+            raise CdrError(f"{definition.name}: {error}") from None
 
     @property
     def key(self) -> tuple[Any, ...]:

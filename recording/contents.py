@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -153,8 +154,9 @@ def _indexes_all(contents: Contents) -> bool:
 def _read_header(file: FileReader, contents: Contents) -> None:
     opcode, length = _RECORD_HEAD.unpack(file.read(8, 9))
     if opcode == Opcode.HEADER:
-        header = Header.read(ReadDataStream(BytesIO(file.read(17, length))))
-        contents.profile, contents.library = header.profile, header.library
+        with contextlib.suppress(*BROKEN):  # nothing that is read depends on it
+            header = Header.read(ReadDataStream(BytesIO(file.read(17, length))))
+            contents.profile, contents.library = header.profile, header.library
 
 
 def _scan(file: FileReader, reason: str) -> Contents:

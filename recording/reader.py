@@ -409,9 +409,11 @@ class Recording:
         channel = self.channels[source.topic]
         if channel.count and (first := self._first(source)) is not None:
             return first[0].clear()
-        if source.decoder is None or source.decoder.schema is None or not channel.columns:
+        schema = source.decoder.schema if source.decoder is not None else None
+        columns = channel.columns or (schema.needed if schema is not None else ())
+        if source.decoder is None or schema is None or not columns:
             return pl.DataFrame(schema=TIME_TYPES)
-        encoder = Encoder(source.decoder.schema, channel.columns, channel.frame_id, channel.topic, 0)
+        encoder = Encoder(schema, columns, channel.frame_id, channel.topic, 0)
         return source.decoder.decode(_nothing(encoder.blank())).clear()
 
     def _describe(self, source: TopicSource, spans: dict[int, tuple[int, int, int]]) -> Channel:

@@ -15,7 +15,7 @@ from ..recording.errors import OutputExists, UsageError
 from ..recording.provenance import hash_file
 from .clock import Clock
 from .engine import Engine, Progress
-from .evaluate import evaluate, evaluate_run, recording_view
+from .evaluate import evaluate, evaluate_run, recording_view, truth_of
 from .gaps import GapPolicy, Gaps
 from .plan import EstimatorLike, plan_runs
 from .results import ReplayResult, Run
@@ -118,6 +118,8 @@ def replay(
             )
         if target.exists() and not overwrite:
             raise OutputExists(target)
+    if rec is not None and metrics:
+        truth_of(rec.metadata)  # what cannot be measured against is said before anything is written
     taken = [n.removeprefix("run/") for n in rec.metadata if n.startswith("run/")] if rec is not None else []
     taken += {t.split("/")[2] for t in source.channels if t.startswith("/estimate/") and t.count("/") > 2}
     runs = plan_runs(source, estimators, params, inputs, taken, calibrations)

@@ -11,7 +11,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ..recording.errors import UsageError
-from .view import inside
+from .trajectory import inside
 
 PAUSE_S = 3.0
 """A stride that takes longer is standing in between."""

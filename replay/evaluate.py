@@ -18,7 +18,8 @@ from .gaitcycles import JointCycles, cycles
 from .metrics import available_metrics
 from .metrics_joint import doubts
 from .references import KINDS, reference_of, references
-from .view import RunView, Truth, joined
+from .trajectory import joined
+from .view import RunView, Truth
 
 NO_MARKS = pl.DataFrame(
     schema={"tier": pl.String, "start_ns": pl.Int64, "end_ns": pl.Int64, "label": pl.String}
@@ -264,7 +265,8 @@ def recording_view(
             return None
         if columns is None or not rec.channels[topic].count:
             return rec.table(topic)
-        return pl.concat([_some(w.tables[topic], columns) for w in rec.windows([topic])])
+        parts = [_some(w.tables[topic], columns) for w in rec.windows([topic])]
+        return pl.concat(parts) if parts else rec.table(topic)
 
     def stream(name: str) -> tuple[int, Iterator[pl.DataFrame]] | None:
         topic = f"/estimate/{run}/{name}"

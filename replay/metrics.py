@@ -18,7 +18,8 @@ import polars as pl
 
 from ..algorithms.contract import FloatArray
 from .alignment import IntArray, Transform, match, wrap
-from .view import VELOCITY, RunView, inside
+from .trajectory import inside
+from .view import VELOCITY, RunView
 
 Metric = Callable[[RunView], Mapping[str, float]]
 BETWEEN = "(between)"

@@ -16,7 +16,7 @@ import polars as pl
 
 from ..algorithms.contract import FloatArray
 from .alignment import IntArray
-from .view import inside
+from .trajectory import inside
 
 if TYPE_CHECKING:
     from .view import RunView

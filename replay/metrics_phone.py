@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .alignment import IntArray
-from .view import inside
+from .trajectory import inside
 
 if TYPE_CHECKING:
     import polars as pl

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..algorithms.contract import AlgorithmError, FloatArray
 from ..algorithms.phone.horn import horn
 from .alignment import IntArray, match
-from .view import stepwise, track_of
+from .trajectory import stepwise, track_of
 
 if TYPE_CHECKING:
     from .view import RunView

@@ -16,7 +16,7 @@ from marcha.recording import Recording, UsageError
 from marcha.replay import RunView, evaluate, replay
 from marcha.replay.evaluate import evaluate_run
 from marcha.replay.metrics_joint import joints
-from marcha.replay.view import inside, joined
+from marcha.replay.trajectory import inside, joined
 
 from .cli_helpers import marcha
 

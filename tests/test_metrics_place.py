@@ -16,7 +16,7 @@ from marcha.ingest.simulate import simulate
 from marcha.recording import UsageError
 from marcha.replay import RunView, align
 from marcha.replay import metrics_place as mp
-from marcha.replay.view import Trajectory, stepwise
+from marcha.replay.trajectory import Trajectory, stepwise
 
 S = 1_000_000_000
 LAT, LON = 48.0, 11.0

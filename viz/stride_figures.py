@@ -13,7 +13,7 @@ from ..recording import Recording
 from ..recording.errors import UsageError
 from ..replay.metrics import BETWEEN
 from ..replay.metrics_joint import JOINT_STATE, cycles_of, joint_columns, starts_from_signal
-from ..replay.view import inside, joined
+from ..replay.trajectory import inside, joined
 from . import style
 from .canvas import is_estimate
 from .text import printable

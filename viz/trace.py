@@ -9,7 +9,8 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ..replay.alignment import Transform
-from ..replay.view import POSITION, QUATERNION, Comparison, RunView, compare
+from ..replay.trajectory import POSITION, QUATERNION
+from ..replay.view import Comparison, RunView, compare
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
