@@ -211,7 +211,8 @@ def beside_published(group_table: pl.DataFrame, config: cfg.StudyConfig) -> pl.D
     """Put published means beside the measured ones.
 
     Columns: ``table, by, metric, unit, filter``, the factors, ``configuration, published, published_sd,
-    measured, measured_sd, n, ratio, origin, note``. Measured values are NaN where the study has none.
+    published_max, published_min, measured, measured_sd, measured_max, measured_min, n, ratio, origin, note``.
+    Measured values are null where the study has none, published ones where they are not known.
     """
     measured = {
         (r["metric"], *(r[f] for f in factors(config))): r
@@ -229,7 +230,12 @@ def beside_published(group_table: pl.DataFrame, config: cfg.StudyConfig) -> pl.D
                 levels[table.by] = row_label
             for configuration, value in cells.items():
                 found = measured.get((table.metric, label, *levels.values(), configuration))
-                sd = table.sd.get(row_label, {}).get(configuration)
+                more = {
+                    f"published_{name}": None
+                    if (known := part.get(row_label, {}).get(configuration)) is None
+                    else known * table.scale
+                    for name, part in (("sd", table.sd), ("max", table.maximum), ("min", table.minimum))
+                }
                 published = value * table.scale
                 rows.append(
                     {
@@ -241,16 +247,18 @@ def beside_published(group_table: pl.DataFrame, config: cfg.StudyConfig) -> pl.D
                         **levels,
                         "configuration": configuration,
                         "published": published,
-                        "published_sd": None if sd is None else sd * table.scale,
+                        **more,
                         "measured": found["mean"] if found else None,
                         "measured_sd": found["sd"] if found else None,
+                        "measured_max": found["maximum"] if found else None,
+                        "measured_min": found["minimum"] if found else None,
                         "n": found["n"] if found else 0,
                         "ratio": found["mean"] / published if found and published else None,
                         "origin": table.origin,
                         "note": table.note,
                     }
                 )
-    floats = ("published", "published_sd", "measured", "measured_sd")
+    floats = tuple(f"{of}{part}" for of in ("published", "measured") for part in ("", "_sd", "_max", "_min"))
     schema = {
         **dict.fromkeys(("table", "by", "metric", "unit", *factors(config)), pl.String),
         **dict.fromkeys(floats, pl.Float64),

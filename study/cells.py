@@ -283,7 +283,7 @@ def _concerns(finding: dict[str, Any], topic: str, rec: Recording) -> bool:
 
 
 def _track(run: Run) -> bytes:
-    table = run.tables.get("pose")
+    table = run.tables.get("pose", run.tables.get("position"))
     if table is None or not {"pos_x", "pos_y", "pos_z"} <= set(table.columns) or not table.height:
         return b""
     rows = np.unique(np.linspace(0, table.height - 1, TRACK_POINTS).round().astype(int))

@@ -224,8 +224,8 @@ class Published(_Table, frozen=True, kw_only=True):
         Estimator that the table holds fixed; empty where it is the row.
     levels : dict of str to str
         Levels of the factors that the table holds fixed.
-    sd : dict
-        Published standard deviations, same shape.
+    sd, maximum, minimum : dict
+        Published standard deviations and extremes, same shape.
     table : str
         Number of the table in the source.
     note : str
@@ -240,6 +240,8 @@ class Published(_Table, frozen=True, kw_only=True):
     estimator: str = ""
     levels: dict[str, str] = {}
     sd: dict[str, dict[str, float]] = {}
+    maximum: dict[str, dict[str, float]] = {}
+    minimum: dict[str, dict[str, float]] = {}
     table: str = ""
     note: str = ""
 

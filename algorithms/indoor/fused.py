@@ -90,7 +90,11 @@ class IndoorFused(KernelEstimator):
     title: ClassVar[str] = "each signal strength as it comes, steps, walls and radio map: particle filter"
     source: ClassVar[str] = "Doucet et al. 2000 (Rao–Blackwellised particles); Gudmundson 1991 (shadowing)"
     Params: ClassVar[type[msgspec.Struct]] = IndoorFusedParams
-    presets: ClassVar = {"no-map": {"use_map": False}}
+    presets: ClassVar = {
+        "no-map": {"use_map": False},
+        # Steps between walls alone: nothing but particles keeps the ways round a corner apart.
+        "walls": {"particles": 4000, "known_start": True, "start_sd_m": 0.3},
+    }
     inputs = (
         Input("radio", "marcha_msgs/msg/RadioSignal", ("mac", "rssi_dbm"), optional=True, many=True),
         RANGES,
@@ -123,6 +127,8 @@ class IndoorFused(KernelEstimator):
         if not heard and not (stepped and p.known_start):
             raise AlgorithmError(f"{self.name} needs signal strengths or ranges, or steps from a known start")
         self.anchors = anchors
+        steps = context.channels.get("steps", ())
+        self.from_east = bool(steps) and steps[0].frame_id != "plan"
         calibration = context.calibrations.get("radio")
         height = p.height_m or (float(calibration.values.get("height_m", 1.2)) if calibration else 1.2)
         radio_map = map_of(context, anchors, height) if p.use_map else None
@@ -161,6 +167,8 @@ class IndoorFused(KernelEstimator):
             "rng": np.uint64(0x9E3779B97F4A7C15) ^ np.uint64(p.seed * 2654435761 + 1),
             "spare": math.nan,
             "walking": int(stepped),
+            "own_steps": int(not context.has("steps")),
+            "known_start": int(p.known_start),
             "x_axis": x_axis,
             "mirrored": int(mirrored),
             "low": low,
@@ -210,9 +218,17 @@ class IndoorFused(KernelEstimator):
         return cloud
 
     def encode(self, index: int, channel: int, table: pl.DataFrame) -> FloatArray:
-        """Return messages as numbers; an address becomes the anchor's number, −1 where it is not known."""
+        """Return messages as numbers; an address becomes the anchor's number, −1 where it is not known.
+
+        Headings of steps that are given from east (anticlockwise) are turned to the plan's x axis.
+        """
         if index > 1:
-            return super().encode(index, channel, table)
+            values = super().encode(index, channel, table)
+            if index == 2 and self.from_east:
+                one = self.state.s[0]
+                turned = values[:, 1] - (0.5 * math.pi - one["x_axis"])
+                values[:, 1] = -turned if one["mirrored"] else turned
+            return values
         number = self.anchors.number
         out = np.empty((table.height, 2))
         out[:, 0] = [number.get(mac, -1) for mac in table["mac"].to_list()]

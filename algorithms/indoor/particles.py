@@ -21,13 +21,18 @@ from .steps import take_acceleration
 X, Y, VX, VY, OFFSET, SCALE, GAIN, PATH, LOGW, COLUMNS = range(10)
 """Columns of a particle; PATH is the distance that it has walked (m), GAIN the receiver's offset (dB)."""
 
+QUIET_NS = 50_000_000
+"""A position is stated this long after the last one also where no power and no step came."""
+
 SETTINGS = np.dtype(
     [
         ("t_ns", "i8"),  # up to which the particles have moved, −1 before the first message
         ("rng", "u8"),
         ("spare", "f8"),  # second normal of a pair, NaN where there is none
         ("walking", "i8"),  # whether steps are known: no free velocity then
-        ("azimuth_known", "i8"),
+        ("own_steps", "i8"),  # whether steps are detected here, not given
+        ("known_start", "i8"),
+        ("told_ns", "i8"),  # time of the newest result
         ("x_axis", "f8"),
         ("mirrored", "i8"),
         ("low", "f8", 2),
@@ -368,8 +373,10 @@ def run(
                 _step(c, values[m, 0], values[m, 1])
                 answered = True
         elif kind == 3:
-            if take_acceleration(walk, t_ns[m], values[m, 0], values[m, 1], values[m, 2]) and not math.isnan(
-                walk.azimuth
+            if (
+                s.own_steps == 1
+                and take_acceleration(walk, t_ns[m], values[m, 0], values[m, 1], values[m, 2])
+                and not math.isnan(walk.azimuth)
             ):
                 _drift(c, t_ns[m])
                 _step(c, s.step_m, _heading(c, walk.azimuth))
@@ -377,7 +384,11 @@ def run(
         else:
             qw, qx, qy, qz = values[m, 0], values[m, 1], values[m, 2], values[m, 3]
             walk.azimuth = math.atan2(2.0 * (qx * qy - qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz))
+        if not answered and s.received + s.steps + s.known_start > 0 and t_ns[m] - s.told_ns >= QUIET_NS:
+            _drift(c, t_ns[m])  # nothing was heard for a while: where it may be by now
+            answered = True
         if answered:
+            s.told_ns = t_ns[m]
             out = out_values[count]
             for k in range(out.size):
                 out[k] = math.nan

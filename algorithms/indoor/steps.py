@@ -83,6 +83,21 @@ def make_state(
     return state
 
 
+@compiled
+def detect_steps(s: Any, acceleration: Any, orientation: Any, t_ns: Any, values: Any, out: Any) -> None:
+    """Fill ``out`` with the azimuth (rad) of the step that ends with each message, NaN where none does.
+
+    ``acceleration`` and ``orientation`` say of each message whether it is one; ``values`` are x, y, z or w, x, y, z.
+    """
+    for m in range(t_ns.size):
+        out[m] = math.nan
+        if orientation[m]:
+            w, x, y, z = values[m, 0], values[m, 1], values[m, 2], values[m, 3]
+            s.azimuth = math.atan2(2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z))
+        elif acceleration[m] and take_acceleration(s, t_ns[m], values[m, 0], values[m, 1], values[m, 2]):
+            out[m] = s.azimuth
+
+
 def azimuth_of(w: float, x: float, y: float, z: float) -> float:
     """Return the azimuth (rad, clockwise from north) of the y axis under a rotation to east, north, up."""
     east, north = 2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z)

@@ -44,23 +44,23 @@ class SimulatedAnchor(msgspec.Struct, frozen=True):
     def mac(self) -> str:
         """Address, made of the number."""
         first = "a4:6c:2a:00:00" if self.technology == "wifi" else "a0:e6:f8:00:00"
-        return f"{first}:{int(self.name.removeprefix('anchor ')):02x}"
+        return f"{first}:{int(self.name.removeprefix('anchor')):02x}"
 
 
 WIFI_Z, BLE_Z = 2.6, 0.8
 ANCHORS = (
-    SimulatedAnchor("anchor 1", "wifi", 23.1, 1.5, WIFI_Z, -38.0, 2.43),
-    SimulatedAnchor("anchor 2", "wifi", 1.5, 6.9, WIFI_Z, -38.0, 2.12),
-    SimulatedAnchor("anchor 3", "ble", 3.9, 1.5, BLE_Z, -57.55, 1.71),
-    SimulatedAnchor("anchor 4", "ble", 8.1, 5.7, BLE_Z, -57.55, 1.61),
-    SimulatedAnchor("anchor 5", "ble", 18.3, 6.3, BLE_Z, -57.55, 1.53),
-    SimulatedAnchor("anchor 6", "ble", 17.7, 0.9, BLE_Z, -57.55, 1.68),
+    SimulatedAnchor("anchor1", "wifi", 23.1, 1.5, WIFI_Z, -38.0, 2.43),
+    SimulatedAnchor("anchor2", "wifi", 1.5, 6.9, WIFI_Z, -38.0, 2.12),
+    SimulatedAnchor("anchor3", "ble", 3.9, 1.5, BLE_Z, -57.55, 1.71),
+    SimulatedAnchor("anchor4", "ble", 8.1, 5.7, BLE_Z, -57.55, 1.61),
+    SimulatedAnchor("anchor5", "ble", 18.3, 6.3, BLE_Z, -57.55, 1.53),
+    SimulatedAnchor("anchor6", "ble", 17.7, 0.9, BLE_Z, -57.55, 1.68),
 )
 """Table 5.1 of the source, heights of section 5.1."""
 SIZE_M = (25.0, 8.4)
 """The floor, from (0, 0)."""
 ROUTES = {
-    "floor-walk": ((3.0, 3.0), "15:left 90,2.5:left 90,11"),
+    "floor-walk": ((2.5, 2.2), "9.5:left 90,1.5:right 90,8.5"),
     "floor-loop": ((2.5, 2.0), "20:left 90,4.5:left 90,20:left 90,4.5"),
 }
 """Start in the plan and legs, the first along the plan's x axis."""
@@ -104,7 +104,7 @@ class FloorOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         Length of one of the 20 samples at a point (scenario floor-points), and of the stay at a point of the survey.
     """
 
-    shadow_db: _NonNegative = 1.6
+    shadow_db: _NonNegative = 1.4
     shadow_m: _Positive = 3.0
     multipath_db: _NonNegative = 3.0
     blocked_db: _NonNegative = 4.0
@@ -116,7 +116,7 @@ class FloorOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     ble_s: _Positive = 0.3
     weakest_dbm: float = -95.0
     plan_azimuth_deg: float = 74.0
-    azimuth_bias_deg: _NonNegative = 3.0
+    azimuth_bias_deg: _NonNegative = 6.0
     azimuth_noise_deg: _NonNegative = 2.0
     start_x: float | None = None
     start_y: float | None = None
@@ -183,7 +183,7 @@ def floor_walk(scenario: str = "floor-walk", *, seed: int = 0, **given: Any) -> 
             [o.start_x if o.start_x is not None else x0, o.start_y if o.start_y is not None else y0]
         )
         declination = np.degrees(phone_walk("phone-rest", seed=0, duration_s=0.5).declination_rad)
-        course = {"route": route, "course_deg": o.plan_azimuth_deg + float(declination)}
+        course = {"route": route, "course_deg": o.plan_azimuth_deg + float(declination), "rest_s": REST_S}
         phone = phone_walk("phone-turns", seed=seed, **{**course, **given})
         # plan x = along the x axis, y to the left of it; the walk's own frame is east, true north
         east, north = phone.pos[:, 0], phone.pos[:, 1]
@@ -288,5 +288,7 @@ def _radio(t_ns: np.ndarray, position: FloatArray, o: FloorOptions, seed: int) -
     return pl.concat(parts).sort("t_ns", maintain_order=True)
 
 
+REST_S = 12.0
+"""Standing (s) at both ends: the final position is where the person has stopped for two windows."""
 HELD_Z = 1.2
 """Height (m) of the phone in the hand."""
