@@ -128,7 +128,8 @@ class IndoorFused(KernelEstimator):
             raise AlgorithmError(f"{self.name} needs signal strengths or ranges, or steps from a known start")
         self.anchors = anchors
         steps = context.channels.get("steps", ())
-        self.from_east = bool(steps) and steps[0].frame_id != "plan"
+        north = plan_frame(context, p.x_axis_azimuth_deg)[2]  # without it headings are taken as the plan's
+        self.from_east = bool(steps) and steps[0].frame_id != "plan" and north
         calibration = context.calibrations.get("radio")
         height = p.height_m or (float(calibration.values.get("height_m", 1.2)) if calibration else 1.2)
         radio_map = map_of(context, anchors, height) if p.use_map else None

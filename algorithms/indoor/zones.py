@@ -33,7 +33,7 @@ class ZoneParams(msgspec.Struct, frozen=True, kw_only=True):
 
     least: Annotated[
         float, meta("probability that another zone needs before the answer changes", "1", "", ge=0, le=1)
-    ] = 0.6
+    ] = 0.75
 
 
 class IndoorZones(PlainEstimator):

@@ -104,7 +104,7 @@ class FloorOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         Length of one of the 20 samples at a point (scenario floor-points), and of the stay at a point of the survey.
     """
 
-    shadow_db: _NonNegative = 1.4
+    shadow_db: _NonNegative = 2.0
     shadow_m: _Positive = 3.0
     multipath_db: _NonNegative = 3.0
     blocked_db: _NonNegative = 4.0

@@ -86,7 +86,9 @@ class DeclarationContract:
         assert estimator.name
         assert estimator.inputs
         assert len({i.name for i in estimator.inputs}) == len(estimator.inputs)
-        assert not all(i.optional for i in estimator.inputs)
+        if all(i.optional for i in estimator.inputs):  # then one of them must be there all the same
+            with pytest.raises(AlgorithmError):
+                estimator.start(Context())
 
     def test_every_parameter_says_what_it_does(self) -> None:
         for parameter in describe(type(self.make()).Params):

@@ -1,0 +1,207 @@
+"""Surveys, offsets of receivers, the smoother, zones, errors on a plan, the simulated floor."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import polars as pl
+import pytest
+from marcha.algorithms import AlgorithmError, Stretch, make
+from marcha.algorithms.indoor.calibrate import RadioCalibration
+from marcha.algorithms.indoor.places import coverage
+from marcha.ingest import convert
+from marcha.ingest.simulate import FLOOR_SCENARIOS, floor_walk, simulate
+from marcha.ingest.simulate.floor import ANCHORS, HELD_Z, shadowing
+from marcha.recording import open as open_recording
+from marcha.replay import evaluate, replay
+from marcha.replay.evaluate import recording_view
+from marcha.replay.metrics_indoor import position_errors
+
+from .event_loop import context_of, drive
+from .test_indoor_contracts import PLAN, survey
+from .test_indoor_estimators import FLOOR, errors, heard, table, walk
+
+
+@pytest.mark.parametrize(("method", "most"), [("knn", 2.5), ("map", 1.5)])
+def test_fingerprints_need_no_anchor_positions(method, most):
+    still = np.tile([12.0, 4.0], (400, 1))
+    found = drive(
+        make("indoor.fingerprint", method=method),
+        {"radio": {"/indoor/radio": heard(still, 1.0)}},
+        calibrations={"radio": survey()},
+    )
+    assert found["position"].height >= 5
+    assert errors(found["position"], still).mean() < most
+    assert (found["sigma"]["sigma_pos_x"].to_numpy() > 0).all()
+
+
+def test_fingerprints_without_a_survey_say_how_to_get_one():
+    estimator = make("indoor.fingerprint")
+    with pytest.raises(AlgorithmError, match="marcha calibrate radio"):
+        estimator.start(context_of(estimator, {"radio": {"/r": heard(walk(20), 1.0)}}))
+
+
+def test_neighbours_equal_scikit_learn():
+    """The k nearest places by the mean square of powers, where all transmitters are heard."""
+    from sklearn.neighbors import NearestNeighbors
+
+    calibration = survey()
+    places = calibration.values["places"]
+    macs = sorted({m for p in places for m in p["powers"]})
+    powers = np.array([[p["powers"][m] for m in macs] for p in places])
+    estimator = make("indoor.fingerprint", method="knn", neighbours=3)
+    estimator.start(
+        context_of(estimator, {"radio": {"/r": heard(walk(20), 1.0)}}, calibrations={"radio": calibration})
+    )
+    here = powers[7] + np.array([1.0, -2.0, 0.5, 1.5, -1.0, 2.0])
+    far, near = NearestNeighbors(n_neighbors=3).fit(powers).kneighbors(here[None])
+    weight = 1 / (far[0] / np.sqrt(len(macs)))
+    wanted = weight @ np.array([[places[i]["x"], places[i]["y"]] for i in near[0]]) / weight.sum()
+    mean, _ = estimator._nearest(np.arange(len(macs)), here)
+    assert mean == pytest.approx(wanted)
+
+
+def test_two_receivers_get_their_offsets_and_a_recording_of_one_is_corrected():
+    rng = np.random.default_rng(8)
+    stretches = []
+    for name, offset in (("phone one", 3.0), ("phone two", -3.0)):
+        parts, where = [], []
+        for k in range(25):
+            place = rng.uniform([0, 0], [24, 8])
+            part = heard(np.tile(place, (60, 1)), 1.0, seed=k).with_columns(
+                pl.col("t_ns") + k * 10_000_000_000, pl.col("rssi_dbm") + offset
+            )
+            parts.append(part)
+            where += [(part["t_ns"][0], *place, 1.2), (part["t_ns"][-1], *place, 1.2)]
+        position = pl.DataFrame(where, schema=["t_ns", "pos_x", "pos_y", "pos_z"], orient="row")
+        tables = {"radio": (pl.concat(parts),), "position": (position,)}
+        stretches.append(Stretch({}, tables, {"device": {"phone": name}}, table(model=False), name))
+    found = RadioCalibration().calibrate(stretches)
+    assert found.values["offsets_db"]["phone one"] == pytest.approx(3.0, abs=0.5)
+    assert sum(found.values["offsets_db"].values()) == pytest.approx(0.0, abs=1e-9)
+    own = {a["mac"]: a for a in found.values["anchors"]}
+    assert np.mean([a["p_d0"] for a in own.values()]) == pytest.approx(-57.55, abs=1.0)
+
+
+def test_coverage_is_that_of_a_grid():
+    grid = [np.array([x, y, 0.0]) for x in range(0, 11, 2) for y in range(0, 5, 2)]
+    found = coverage(grid)
+    assert found["area_m2"] == pytest.approx(40.0)
+    assert found["most_m"] == pytest.approx(np.sqrt(2.0), abs=0.1)
+    assert coverage([np.zeros(3), np.ones(3)])["area_m2"] == 0.0
+
+
+def test_the_smoother_is_nearer_than_the_filter_and_says_so_honestly():
+    path = walk()
+    tables = {"radio": {"/indoor/radio": heard(path, 4.0)}}
+    ahead = drive(make("indoor.fused", seed=3), tables, attachments=table())
+    whole = drive(make("indoor.smooth", seed=3), tables, attachments=table())
+    assert make("indoor.smooth").offline
+    assert errors(whole["position"], path).mean() < errors(ahead["position"], path).mean()
+    sd = whole["sigma"].select("sigma_pos_x", "sigma_pos_y").to_numpy()
+    delta = errors(whole["position"], path)
+    assert (delta**2 < 5.991 * (sd**2).sum(axis=1)).mean() > 0.85
+
+
+def test_given_steps_are_not_detected_a_second_time():
+    """Steps of 0.5 m and accelerations of the same steps together go 10 m, not 20."""
+    n = 20
+    steps = pl.DataFrame(
+        {"t_ns": np.arange(1, n + 1) * 500_000_000, "length_m": np.full(n, 0.5), "heading_rad": np.zeros(n)}
+    )
+    t = np.arange(0, 10, 0.02)
+    up = 9.8 + 2 * np.sin(2 * np.pi * t / 0.5)
+    imu = pl.DataFrame({"t_ns": (t * 1e9).astype(np.int64), "acc_x": 0 * t, "acc_y": 0 * t, "acc_z": up})
+    turn = pl.DataFrame({"t_ns": [0], "quat_w": [1.0], "quat_x": [0.0], "quat_y": [0.0], "quat_z": [0.0]})
+    tables = {"steps": {"/s": steps}, "imu": {"/phone/acc": imu}, "orientation": {"/phone/orientation": turn}}
+    given = {
+        "known_start": True,
+        "heading_sd_deg": 1.0,
+        "scale_sd": 0.01,
+        "step_sd": 0.01,
+        "turn_sd_deg": 1.0,
+    }
+    # the steps' channel is in no plan's frame: their headings are from east, and the plan's x axis points there
+    plan = {"plan.geojson": json.dumps({"x_axis_azimuth_deg": 90.0, "features": []}).encode()}
+    found = drive(make("indoor.fused", walls=False, **given), tables, attachments=plan)
+    end = found["position"].select("pos_x", "pos_y").row(-1)
+    assert end == pytest.approx((10.0, 0.0), abs=0.5)
+    north = {"plan.geojson": json.dumps({"x_axis_azimuth_deg": 1e-9, "features": []}).encode()}
+    found = drive(make("indoor.fused", walls=False, **given), tables, attachments=north)
+    assert found["position"].select("pos_x", "pos_y").row(-1) == pytest.approx((0.0, -10.0), abs=0.5)
+
+
+def test_zones_have_probabilities_and_do_not_flicker():
+    t = np.arange(61) * 100_000_000
+    x = 10.0 + np.concatenate([np.full(20, -3.0), 0.2 * (-1.0) ** np.arange(21), np.full(20, 3.0)])
+    tables = {
+        "position": {"/p": pl.DataFrame({"t_ns": t, "pos_x": x, "pos_y": np.full(61, 4.0)})},
+        "sigma": {"/s": pl.DataFrame({"t_ns": t, "sigma_pos_x": np.ones(61), "sigma_pos_y": np.ones(61)})},
+    }
+    found = drive(make("indoor.zones"), tables, attachments={"plan.geojson": json.dumps(PLAN).encode()})
+    table_ = found["zone"]
+    assert table_.select(
+        pl.sum_horizontal("west", "east", "outside")
+    ).to_series().to_numpy() == pytest.approx(1.0)
+    assert table_["west"][5] > 0.95 > 0.7 > table_["west"][30] > 0.3
+    assert found["stay"]["zone"].to_list() == [0.0, 1.0]  # once in the west, once in the east
+    with pytest.raises(AlgorithmError, match="names no zone"):
+        drive(make("indoor.zones"), tables)
+
+
+def test_shadowing_is_a_field_of_unit_variance_and_exponential_correlation():
+    place = np.column_stack([np.linspace(0, 3, 4), np.zeros(4)])
+    draws = np.array([shadowing(place, 3.0, np.random.default_rng(k)) for k in range(3000)])
+    assert draws.std(axis=0) == pytest.approx(1.0, abs=0.05)
+    correlation = np.corrcoef(draws.T)[0]
+    assert correlation == pytest.approx(np.exp(-place[:, 0] / 3.0), abs=0.07)
+
+
+def test_the_simulated_floor_states_its_sigma_and_repeats_itself():
+    quiet = floor_walk("floor-walk", seed=4, shadow_db=0.0, multipath_db=0.0, blocked_share=0.0)
+    for anchor in ANCHORS:
+        mine = quiet.radio.filter(pl.col("mac") == anchor.mac)
+        model = anchor.p_d0 - 10 * anchor.eta * np.log10(mine["true_m"].to_numpy())
+        assert np.abs(mine["rssi_dbm"].to_numpy() - model).max() <= 0.5  # whole dB
+    loud = floor_walk("floor-survey", seed=4, blocked_share=0.0)
+    left = []
+    for anchor in ANCHORS:
+        mine = loud.radio.filter((pl.col("mac") == anchor.mac) & (pl.col("rssi_dbm") > -88))
+        left.append(
+            mine["rssi_dbm"].to_numpy() - anchor.p_d0 + 10 * anchor.eta * np.log10(mine["true_m"].to_numpy())
+        )
+    spread = np.hypot(loud.options.shadow_db, loud.options.multipath_db)
+    assert np.concatenate(left).std() == pytest.approx(spread, rel=0.15)
+    assert floor_walk("floor-walk", seed=4).radio.equals(floor_walk("floor-walk", seed=4).radio)
+    start = quiet.position[0]
+    assert start == pytest.approx([2.5, 2.2], abs=0.05)
+    assert quiet.position[-1] == pytest.approx([20.5, 3.7], abs=0.6)
+
+
+def test_a_simulated_walk_becomes_a_track_on_the_plan(tmp_path):
+    assert set(FLOOR_SCENARIOS) >= {"floor-walk", "floor-points", "floor-survey"}
+    made = simulate("floor-walk", tmp_path, seed=2)
+    done = convert(made.paths, tmp_path / "w.mcap")
+    assert not done.report.findings
+    rec = open_recording(tmp_path / "w.mcap")
+    start = "known_start=true,start_x=2.5,start_y=2.2"
+    replay(
+        rec,
+        [f"indoor.fused[{start}]", f"indoor.pdr[{start}]", "indoor.fused+indoor.zones"],
+        out=tmp_path / "d.mcap",
+    )
+    runs = evaluate(open_recording(tmp_path / "d.mcap")).runs
+    found = {r.estimator: r for r in reversed(runs)}
+    fused = found["indoor.fused"].metrics
+    assert found["indoor.fused"].alignment == found["indoor.pdr"].alignment == "none"
+    assert fused["position_error_mean_m"] < 1.5 < found["indoor.pdr"].metrics["position_error_end_m"] + 1.5
+    assert 80 < fused["ellipse95_percent"] <= 100
+    assert {"position_error_mean_m.west_hall", "position_error_mean_m.heard6"} <= set(fused)
+    rec = open_recording(tmp_path / "d.mcap")
+    lineage = next(m for n, m in rec.metadata.items() if n == f"run/{found['indoor.fused'].run}")
+    errors_ = position_errors(recording_view(rec, lineage, None))
+    assert errors_ is not None
+    assert errors_["error_m"].to_numpy().mean() == pytest.approx(fused["position_error_mean_m"], abs=0.01)
+    assert set(errors_["zone"]) == {"west hall", "corridor", "east hall"}
+    assert abs(HELD_Z - FLOOR[0, 1]) < 1  # both lie on one floor
