@@ -16,6 +16,7 @@ from ..viz.page import Html, PagePicture, number
 from . import config as cfg
 from .analysis import base_levels, factors, order
 from .labels import label_means
+from .published import extremes
 
 
 class ReportContents(msgspec.Struct, frozen=True):
@@ -184,36 +185,10 @@ def _means(html: Html, contents: ReportContents, levels: dict[str, list[str]]) -
         html.table(["filter", *levels["configuration"], "all"], rows)
         for table in tables:
             html.text(f"Published: {table.origin} {table.note}".strip(), "note")
-    _extremes(html, contents)
+    extremes(html, contents.published)
     for name in base:
         if (contents.published["by"] == name).any():
             _published_levels(html, contents, name)
-
-
-def _extremes(html: Html, contents: ReportContents) -> None:
-    """Tabulate maximum, minimum and mean beside the published ones, where a source states extremes."""
-    part = contents.published.filter(pl.col("published_max").is_not_null())
-    if not len(part):
-        return
-    html.heading("Maximum, minimum and mean, beside the published ones")
-
-    def three(row: dict[str, Any], of: str) -> str:
-        values = [row[f"{of}_max"], row[f"{of}_min"], row[of]]
-        return " / ".join("–" if v is None else f"{v:.2f}" for v in values)
-
-    rows = [
-        [
-            escape(r["table"]),
-            escape(r["filter"]),
-            escape(r["configuration"]),
-            escape(f"{r['metric']} ({r['unit']})"),
-            three(r, "measured"),
-            str(r["n"]),
-            f"@published {three(r, 'published')}",
-        ]
-        for r in part.iter_rows(named=True)
-    ]
-    html.table(["table", "filter", "configuration", "metric", "measured", "n", "published"], rows, 4)
 
 
 def _published_levels(html: Html, contents: ReportContents, factor: str) -> None:
