@@ -74,6 +74,29 @@ def values(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     )
 
 
+def failures(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
+    """Count the cells whose results must not be used, by method and configuration.
+
+    They are in no mean, no test and no picture: a run that stood still, ran away or could not be read has no
+    error, least of all one of 0. Columns: ``filter``, the factors, ``configuration, cells, failed, share`` and
+    ``reasons`` (the first words of each, with their number).
+    """
+    of = factors(config)
+    reason = pl.col("error").str.split(";").list.first().str.slice(0, 60)
+    found = table.group_by(of, maintain_order=True).agg(
+        cells=pl.len(),
+        failed=(pl.col("status") != "ok").sum(),
+        reasons=reason.filter(pl.col("status") != "ok").value_counts(sort=True),
+    )
+    found = found.filter(pl.col("failed") > 0).with_columns(share=pl.col("failed") / pl.col("cells"))
+    texts = [
+        "; ".join(f"{r['error']} ({r['count']}×)" for r in reasons) for reasons in found["reasons"].to_list()
+    ]
+    return found.select(*of, "cells", "failed", "share").with_columns(
+        reasons=pl.Series("reasons", texts, pl.String)
+    )
+
+
 def order(frame: pl.DataFrame, config: cfg.StudyConfig) -> dict[str, list[str]]:
     """Return the levels of every factor in the order in which they are shown."""
     methods = cfg.methods(config)

@@ -246,6 +246,21 @@ class Published(_Table, frozen=True, kw_only=True):
     note: str = ""
 
 
+class Verdict(_Table, frozen=True, kw_only=True):
+    """What a publication finds best.
+
+    Attributes
+    ----------
+    metric : str
+        Title of the study's metric.
+    smallest : list of str
+        Combinations with the smallest mean, equal among each other: filter and configuration, ``9IEZ C00``.
+    """
+
+    metric: str
+    smallest: list[str]
+
+
 class StudyConfig(_Table, frozen=True, kw_only=True):
     """A whole study; see the classes of its parts.
 
@@ -268,6 +283,10 @@ class StudyConfig(_Table, frozen=True, kw_only=True):
         tables and tests between estimators use. A parameter that is not named keeps the estimators' default.
     metrics : list of Metric
         What is tabulated and tested. Every metric is in ``results.parquet`` anyway.
+    published : list of Published
+        Values of a publication beside the measured ones; every relation between rows is checked.
+    verdicts : list of Verdict
+        Its verdicts.
     tracks : bool
         Keep thinned tracks and draw them.
     by : str
@@ -286,6 +305,7 @@ class StudyConfig(_Table, frozen=True, kw_only=True):
     metrics: list[Metric] = msgspec.field(default_factory=lambda: list(USUAL_METRICS))
     statistics: Statistics = Statistics()
     published: list[Published] = []
+    verdicts: list[Verdict] = []
     tracks: bool = True
     by: str = ""
 

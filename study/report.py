@@ -14,9 +14,11 @@ import polars as pl
 from ..replay.metrics import BETWEEN
 from ..viz.page import Html, PagePicture, number
 from . import config as cfg
+from . import report_tests
 from .analysis import base_levels, factors, order
 from .labels import label_means
 from .published import extremes
+from .report_tests import folded, probability, reasons
 
 
 class ReportContents(msgspec.Struct, frozen=True):
@@ -30,6 +32,10 @@ class ReportContents(msgspec.Struct, frozen=True):
         Tables of :mod:`~marcha.study.analysis`.
     labels, label_comparisons : polars.DataFrame
         Tables of :mod:`~marcha.study.labels`.
+    paired, pairs, verdicts, relations : polars.DataFrame
+        Tables of :mod:`~marcha.study.pairs`.
+    failures : polars.DataFrame
+        Cells whose results must not be used, by method.
     notes : list of str
         What a reader must know before the numbers.
     provenance : dict
@@ -48,19 +54,17 @@ class ReportContents(msgspec.Struct, frozen=True):
     consistency: pl.DataFrame
     labels: pl.DataFrame
     label_comparisons: pl.DataFrame
+    paired: pl.DataFrame
+    pairs: pl.DataFrame
+    verdicts: pl.DataFrame
+    relations: pl.DataFrame
+    failures: pl.DataFrame
     notes: list[str]
     provenance: dict[str, Any]
     toml: str
 
 
 NEES_TITLES = {"nees_position_end": "position at the end", "nees_velocity_end": "velocity at the end"}
-
-
-def probability(value: float | None) -> str:
-    """Return a p value as it is written in papers."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    return "&lt; 0.001" if value < 0.001 else f"{value:.3f}"
 
 
 def mean_sd(row: dict[str, Any] | None) -> str:
@@ -94,7 +98,10 @@ def render(contents: ReportContents, pictures: Sequence[PagePicture]) -> str:
         if len(contents.consistency):
             _consistency(html, contents, pictures)
         _normality(html, contents, pictures)
-        _comparisons(html, contents)
+        report_tests.paired(html, contents)
+        if len(contents.relations) or contents.config.verdicts:
+            report_tests.source(html, contents)
+        report_tests.comparisons(html, contents)
         _outliers(html, contents)
     _origin(html, contents)
     return html.page(contents.config.title)
@@ -115,6 +122,15 @@ def _introduction(html: Html, contents: ReportContents) -> None:
         f"A cell is one filter{' at one level of each factor' if names else ''} on one input of one recording."
     )
     html.warning(contents.notes)
+    if len(contents.failures):
+        of = factors(contents.config)
+        html.heading("Failed cells")
+        html.text("Runs whose results must not be used are in no mean, no test and no picture.", "note")
+        rows = [
+            [*(escape(r[f]) for f in of), f"{r['failed']} of {r['cells']}", escape(r["reasons"])]
+            for r in contents.failures.iter_rows(named=True)
+        ]
+        folded(html, f"{contents.failures['failed'].sum()} cells", [*of, "failed", "why"], rows, len(of) + 2)
 
 
 def _count(number: int, noun: str) -> str:
@@ -328,7 +344,7 @@ def _normality(html: Html, contents: ReportContents, pictures: Sequence[PagePict
     done = tested.filter(pl.col("shapiro_p").is_finite())
     if len(done) < len(tested):
         html.text(
-            f"{len(tested) - len(done)} of {len(tested)} groups are not tested: {_reasons(tested)}.", "note"
+            f"{len(tested) - len(done)} of {len(tested)} groups are not tested: {reasons(tested)}.", "note"
         )
     if len(done):
         of = factors(contents.config)
@@ -343,81 +359,8 @@ def _normality(html: Html, contents: ReportContents, pictures: Sequence[PagePict
             for r in done.iter_rows(named=True)
         ]
         head = ["metric", *of, "n", "W", "p"]
-        _folded(html, f"{len(rows)} groups", head, rows, len(of) + 1)
+        folded(html, f"{len(rows)} groups", head, rows, len(of) + 1)
     html.pictures(p for p in pictures if p.section == "qq")
-
-
-def _reasons(frame: pl.DataFrame) -> str:
-    notes = frame.filter(pl.col("note") != "")["note"].value_counts(sort=True)
-    return "; ".join(f"{r['note']} ({r['count']}×)" for r in notes.head(5).iter_rows(named=True))
-
-
-def _folded(html: Html, title: str, head: Sequence[str], rows: list[list[str]], text_columns: int) -> None:
-    html.parts.append(f"<details{' open' if len(rows) <= 30 else ''}><summary>{escape(title)}</summary>")
-    html.table(head, rows, text_columns)
-    html.parts.append("</details>")
-
-
-def _comparisons(html: Html, contents: ReportContents) -> None:
-    statistics = contents.config.statistics
-    level = 1 - statistics.confidence
-    twin = {"mann-whitney": "Mann-Whitney U", "brunner-munzel": "Brunner-Munzel"}[statistics.nonparametric]
-    html.section("Which means differ")
-    html.text(
-        f"Every pair within a family: Welch's t test and {twin}, two-sided, both corrected by Holm within "
-        "the family, and "
-        f"Hedges' g with its {100 * statistics.confidence:.0f} % interval. Red: below {level:.2f} after the "
-        "correction. "
-        "Filters run on the same walks; the tests treat their values as independent, as the source does, "
-        "which makes "
-        "them careful between filters."
-    )
-    table = contents.comparisons
-    done = table.filter(pl.col("welch_p").is_finite())
-    if len(done) < len(table):
-        html.text(
-            f"{len(table) - len(done)} of {len(table)} pairs are not tested: {_reasons(table)}.", "note"
-        )
-    for (factor,), part in done.group_by("factor", maintain_order=True):
-        html.heading(f"Between {factor}s")
-        for (metric,), rows in part.group_by("metric", maintain_order=True):
-            body: list[list[str]] = []
-            for (within,), family in rows.group_by("within", maintain_order=True):
-                body.append([escape(str(within) or "all together")])
-                for r in family.iter_rows(named=True):
-                    marks = ["@differs " if p < level else "" for p in (r["welch_p_holm"], r["rank_p_holm"])]
-                    body.append(
-                        [
-                            escape(f"{r['a']} − {r['b']}"),
-                            f"{r['n_a']}, {r['n_b']}",
-                            f"{number(r['difference'])} ({number(r['difference_low'])} … "
-                            f"{number(r['difference_high'])})",
-                            number(r["welch_t"]),
-                            number(r["welch_df"]),
-                            marks[0] + probability(r["welch_p_holm"]),
-                            f"{number(r['hedges_g'])} ({number(r['hedges_low'])} … "
-                            f"{number(r['hedges_high'])})",
-                            marks[1] + probability(r["rank_p_holm"]),
-                        ]
-                    )
-            unit = rows["unit"][0]
-            title = f"{metric} ({unit})" if unit else str(metric)
-            count = rows.filter(pl.col("welch_p_holm") < level).height
-            head = [
-                "pair",
-                "n",
-                f"difference{f' ({unit})' if unit else ''}",
-                "t",
-                "df",
-                "p (Holm)",
-                "Hedges' g",
-                f"{twin} p (Holm)",
-            ]
-            html.parts.append(
-                f"<details><summary>{escape(title)}: {count} of {len(rows)} pairs differ</summary>"
-            )
-            html.table(head, body)
-            html.parts.append("</details>")
 
 
 def _labels(html: Html, contents: ReportContents, levels: dict[str, list[str]]) -> None:
@@ -456,7 +399,7 @@ def _labels(html: Html, contents: ReportContents, levels: dict[str, list[str]]) 
             for r in pairs.iter_rows(named=True)
         ]
         head = ["pair", *of, "n", "difference", "d", "t p (Holm)", "Wilcoxon p (Holm)"]
-        _folded(html, f"{len(body)} pairs", head, body, len(of) + 1)
+        folded(html, f"{len(body)} pairs", head, body, len(of) + 1)
 
 
 def _outliers(html: Html, contents: ReportContents) -> None:
@@ -477,7 +420,7 @@ def _outliers(html: Html, contents: ReportContents) -> None:
             [*(escape(str(r[c])) for c in head[:-1]), f"{number(r['value'])} {escape(r['unit'])}"]
             for r in contents.outliers.iter_rows(named=True)
         ]
-        _folded(html, f"{count} values", head, rows, len(head) - 1)
+        folded(html, f"{count} values", head, rows, len(head) - 1)
 
 
 def _least(sigma: float) -> int:

@@ -226,8 +226,11 @@ class PairedComparison(msgspec.Struct, frozen=True):
         Mean of a − b with its interval by Student's t.
     t, t_p : float
         Paired t test, two-sided, with n − 1 degrees of freedom.
-    effect : float
-        Mean difference over its standard deviation (Cohen's d for paired values).
+    effect, effect_low, effect_high : float
+        Mean difference over its standard deviation (Cohen's d for paired values), with its interval from the
+        noncentral t distribution.
+    rank_effect : float
+        Matched-pairs rank-biserial correlation (Kerby 2014): share of the ranks in favour of a > b less the rest.
     rank_p : float
         Wilcoxon's signed-rank test, two-sided.
     t_p_holm, rank_p_holm : float
@@ -243,6 +246,9 @@ class PairedComparison(msgspec.Struct, frozen=True):
     t: float = NAN
     t_p: float = NAN
     effect: float = NAN
+    effect_low: float = NAN
+    effect_high: float = NAN
+    rank_effect: float = NAN
     rank_p: float = NAN
     t_p_holm: float = NAN
     rank_p_holm: float = NAN
@@ -251,7 +257,7 @@ class PairedComparison(msgspec.Struct, frozen=True):
 
 def paired(a: ArrayLike, b: ArrayLike, *, confidence: float = 0.95, min_samples: int = 3) -> PairedComparison:
     """Compare two values of the same walks (finite, in the same order)."""
-    from scipy import stats
+    from scipy import special, stats
 
     x, y = np.asarray(a, float), np.asarray(b, float)
     difference = x - y
@@ -264,6 +270,11 @@ def paired(a: ArrayLike, b: ArrayLike, *, confidence: float = 0.95, min_samples:
     test: Any = stats.ttest_rel(x, y)
     rank: Any = stats.wilcoxon(x, y)
     low, high = test.confidence_interval(confidence)
+    tail = (1 - confidence) / 2
+    root = math.sqrt(n)
+    d_low, d_high = (float(special.nctdtrinc(n - 1, q, test.statistic)) / root for q in (1 - tail, tail))
+    moved = difference[difference != 0]
+    ranks = stats.rankdata(np.abs(moved))
     return PairedComparison(
         n=n,
         difference=mean,
@@ -272,6 +283,9 @@ def paired(a: ArrayLike, b: ArrayLike, *, confidence: float = 0.95, min_samples:
         t=float(test.statistic),
         t_p=float(test.pvalue),
         effect=mean / sd,
+        effect_low=d_low,
+        effect_high=d_high,
+        rank_effect=float((ranks * np.sign(moved)).sum() / ranks.sum()),
         rank_p=float(rank.pvalue),
     )
 

@@ -18,7 +18,7 @@ import polars as pl
 from ..recording import MarchaError, OutputExists, UsageError
 from ..recording.scratch import remove_left
 from ..viz.page import PagePicture
-from . import analysis, labels, plan
+from . import analysis, labels, pairs, plan
 from . import config as cfg
 from .cells import (
     StudyCell,
@@ -41,6 +41,11 @@ TABLES = (
     "consistency",
     "labels",
     "label_comparisons",
+    "paired",
+    "pairs",
+    "verdicts",
+    "relations",
+    "failures",
 )
 LIBRARIES = ("marcha", "numpy", "scipy", "numba", "polars", "matplotlib")
 
@@ -60,6 +65,10 @@ class StudyResult(msgspec.Struct, frozen=True):
         See :mod:`marcha.study.analysis`.
     labels, label_comparisons : polars.DataFrame
         See :mod:`marcha.study.labels`; empty where the study does not say ``by``.
+    paired, pairs, verdicts, relations : polars.DataFrame
+        See :mod:`marcha.study.pairs`.
+    failures : polars.DataFrame
+        See :func:`marcha.study.analysis.failures`.
     cells_run, cells_reused, cells_failed : int
         Cells computed now; found finished; that ended in an error.
     elapsed_s : float
@@ -81,6 +90,11 @@ class StudyResult(msgspec.Struct, frozen=True):
     consistency: pl.DataFrame
     labels: pl.DataFrame
     label_comparisons: pl.DataFrame
+    paired: pl.DataFrame
+    pairs: pl.DataFrame
+    verdicts: pl.DataFrame
+    relations: pl.DataFrame
+    failures: pl.DataFrame
     cells_run: int
     cells_reused: int
     cells_failed: int
@@ -111,6 +125,10 @@ class StudyResult(msgspec.Struct, frozen=True):
             "outliers": rows(self.outliers),
             "consistency": rows(self.consistency),
             "label_comparisons": rows(self.label_comparisons),
+            "failures": rows(self.failures),
+            "paired": rows(self.paired),
+            "verdicts": rows(self.verdicts),
+            "relations": rows(self.relations),
             "files": [str(f.relative_to(self.folder)) for f in self.files],
         }
 
@@ -233,6 +251,7 @@ def run_study(
         )
     groups, comparisons = tables
     by_label = labels.label_values(cells, config)
+    every_pair = pairs.all_pairs(values, config)
     contents = ReportContents(
         config=config,
         results=results,
@@ -244,6 +263,11 @@ def run_study(
         consistency=consistency,
         labels=by_label,
         label_comparisons=labels.label_comparisons(by_label, config),
+        paired=pairs.paired_comparisons(values, config),
+        pairs=every_pair,
+        verdicts=pairs.verdicts(values, every_pair, config),
+        relations=pairs.relations(values, config),
+        failures=analysis.failures(results, config),
         notes=[*notes, *analysis.remarks(cells, config)],
         provenance=_provenance(code, started, scheduler or f"{executor.processes} processes"),
         toml=toml,
@@ -331,7 +355,18 @@ def _write(folder: Path, contents: ReportContents, pictures: list[PagePicture]) 
         "results.csv": contents.results.write_csv,
         "groups.csv": contents.groups.write_csv,
         "comparisons.csv": contents.comparisons.write_csv,
+        "paired.csv": contents.paired.write_csv,
+        **({"failures.csv": contents.failures.write_csv} if len(contents.failures) else {}),
         "outliers.csv": contents.outliers.write_csv,
+        **(
+            {
+                "pairs.csv": contents.pairs.write_csv,
+                "verdicts.csv": contents.verdicts.write_csv,
+                "relations.csv": contents.relations.write_csv,
+            }
+            if contents.config.published or contents.config.verdicts
+            else {}
+        ),
         **(
             {
                 "labels.csv": contents.labels.write_csv,
