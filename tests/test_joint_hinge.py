@@ -88,9 +88,19 @@ def test_axes_positions_and_pairing_of_random_mountings() -> None:
             for o, c, a in zip(hinge["positions_m"], centres, true, strict=True)
         ]
         np.testing.assert_allclose(np.array(found.values["rot_sb_thigh"])[0], hinge["axes"][0], atol=1e-9)
-    assert np.max(errors) < 15.0
-    assert np.median(errors) < 0.5
-    assert np.median(levers) < 0.010
+    assert np.max(errors) < 0.5
+    assert np.max(levers) < 0.010
+
+
+def test_soft_tissue_moves_axes_by_two_degrees_at_most() -> None:
+    """The resonance of skin and muscle lies above the band of the fit; positions are off by centimetres then."""
+    capture, tables, _ = simulated(seed=1, mounting="random", duration_s=40.0, soft_tissue=1.0)
+    joint = capture.joints["knee"]
+    hint = ",".join(f"{v:.2f}" for v in joint.axis_upper_b)
+    found = JointCalibrator(JointCalibrationParams(axis=f"thigh={hint} shank=x")).calibrate([stretch(tables)])
+    hinge = found.values["hinges"][0]
+    for axis, true in zip(hinge["axes"], (joint.axis_upper_b, joint.axis_lower_b), strict=True):
+        assert angle_deg(axis, true) < 2.0
 
 
 def test_not_observable_is_a_verdict() -> None:
@@ -135,6 +145,31 @@ def test_markov_filters_at_an_exoskeletons_pace_are_below_the_published_errors()
             correlations.append(figures["pearson_r"])
         assert np.mean(errors) < published
         assert np.mean(correlations) > 0.994
+
+
+def roll_errors(name: str, seed: int, **options: Any) -> tuple[float, float]:
+    """Return mean RMSE and correlation of both rolls with the preset ``tuned``, brisk walking, known mounting."""
+    capture, tables, t = simulated(seed=seed, duration_s=60.0, mount_deg=0.0, **options)
+    tables["encoder"] = {"/e": pl.DataFrame({"t_ns": t, "knee": capture.joints["knee"].encoder})}
+    attitude = blocks(make(name, preset="tuned"), tables)["attitude"]
+    at = attitude["t_ns"].to_numpy()
+    found = [
+        mj.figures(at, attitude[f"{s}_roll"].to_numpy(), t, capture.segments[s].roll)
+        for s in ("thigh", "shank")
+    ]
+    return float(np.mean([f["rmse_deg"] for f in found])), float(np.mean([f["pearson_r"] for f in found]))
+
+
+def test_tuned_markov_filters_walk_briskly_within_a_degree() -> None:
+    """Seeds that the preset was not chosen on; 1.1 s a cycle, the source's noise and rate."""
+    seeds = (4, 5, 6)
+    for name in ("joint.sme", "joint.smea"):
+        errors, correlations = zip(*(roll_errors(name, seed) for seed in seeds), strict=True)
+        assert np.mean(errors) < 1.0
+        assert min(correlations) > 0.994
+    offset = [roll_errors("joint.sme", seed, encoder_offset_deg=3.0)[0] for seed in seeds]
+    without = [roll_errors("joint.smea", seed)[0] for seed in seeds]
+    assert np.mean(without) < np.mean(offset)
 
 
 def test_free_joint_without_position_says_that_heading_is_not_observable() -> None:

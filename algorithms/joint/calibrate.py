@@ -13,7 +13,7 @@ import numpy as np
 from ..calibration import Calibration, Calibrator, Stretch
 from ..contract import AlgorithmError, FloatArray, Input
 from ..parameters import meta
-from . import axisfit
+from . import axisfit, vectorfit
 from .common import IMU_COLUMNS, imu, joint_name, mount_of, per_segment, vector
 from .merge import SEGMENTS
 
@@ -48,6 +48,17 @@ class JointCalibrationParams(msgspec.Struct, frozen=True, forbid_unknown_fields=
         float, meta("Misfit of the forces along the axes; 0: rates alone (eq 68)", "m/s²", "ours", ge=0.0)
     ] = 0.5
     gravity: Annotated[float, meta("Local gravity", "m/s²", "source", gt=0.0, le=30.0)] = 9.81
+    band_hz: Annotated[
+        float,
+        meta(
+            "Misfits of whole vectors are low-passed here: below the resonance of soft tissue; 0: norms and axes alone "
+            "(eqs 68–72)",
+            "Hz",
+            "ours",
+            ge=0.0,
+            le=20.0,
+        ),
+    ] = 1.5
     max_sd_deg: Annotated[
         float, meta("Largest standard deviation of an axis that is called observable", "deg", "ours", gt=0.0)
     ] = 3.0
@@ -144,7 +155,26 @@ class JointCalibrator(Calibrator):
             paired = axisfit.fit_axes(work[0], rows, len(rows), lag, p.sd_gyr, p.sd_acc, p.gravity)
             axisfit.fit_position(work[0], rows, len(rows), 3.0)  # nearly least squares: a wide basin
             axisfit.fit_position(work[0], rows, len(rows), 0.5)
-        sd = np.degrees(w["axis_sd"])
+        best = vectorfit.Hinge(
+            axes=w["axis"].copy(),
+            positions=w["pos"].copy(),
+            axes_cov=np.array(
+                [
+                    w["tangent"][i].T @ w["cov_axes"][2 * i : 2 * i + 2, 2 * i : 2 * i + 2] @ w["tangent"][i]
+                    for i in (0, 1)
+                ]
+            ),
+            axes_sd=w["axis_sd"].copy(),
+            position_sd=float(w["pos_sd"]),
+            pairing=float(w["pairing"]) if paired else 0.5,
+            biases=np.zeros((2, 3)),
+        )
+        stretches = unbroken([(s[upper], s[lower]) for s in spans if upper in s and lower in s])
+        if p.band_hz > 0.0 and stretches:
+            best = vectorfit.fit(stretches, best.axes, p.band_hz, p.sd_gyr, p.sd_acc)
+        if best.axes[0] @ hint[0] < 0.0:
+            best = best._replace(axes=-best.axes)
+        sd = np.degrees(best.axes_sd)
         still = [n for n, r in zip((upper, lower), w["rate_rms"], strict=True) if r <= 0.05]
         why = ""
         if still:
@@ -153,26 +183,24 @@ class JointCalibrator(Calibrator):
             why = f"both turn as one body ({w['turn_rms']:.2f} rad/s between them, at least 0.1)"
         elif sd.max() > p.max_sd_deg:
             why = f"standard deviation {sd.max():.1f}° above {p.max_sd_deg:g}°: more motion about other directions"
-        elif not paired or w["pairing"] <= 0.55:
-            why = f"the axes' signs cannot be paired ({w['pairing']:.2f} of at least 0.55): axis near the vertical?"
-        cov = {}
-        for i, segment in enumerate((upper, lower)):
-            b = w["tangent"][i]
-            cov[f"axis_{joint}_{segment}"] = (
-                b.T @ w["cov_axes"][2 * i : 2 * i + 2, 2 * i : 2 * i + 2] @ b
-            ).tolist()
-        placed = float(w["pos_sd"]) < 0.05
+        elif best.pairing <= 0.55:
+            why = f"the axes' signs cannot be paired ({best.pairing:.2f} of at least 0.55): axis near the vertical?"
+        placed = best.position_sd < 0.05
         return {
             **found,
             "usable": not why,
             "why": why,
-            "axes": w["axis"].tolist(),
+            "axes": best.axes.tolist(),
             "axes_sd_deg": sd.tolist(),
-            "positions_m": (w["pos"] if placed else 0.0 * w["pos"]).tolist(),
-            "position_sd_m": float(w["pos_sd"]),
-            "pairing": float(w["pairing"]),
+            "positions_m": (best.positions if placed else 0.0 * best.positions).tolist(),
+            "position_sd_m": best.position_sd,
+            "pairing": best.pairing,
+            "gyr_bias_rad_s": best.biases.tolist(),
             "samples": len(rows),
-            "cov": cov,
+            "cov": {
+                f"axis_{joint}_{segment}": best.axes_cov[i].tolist()
+                for i, segment in enumerate((upper, lower))
+            },
         }
 
     def functional(self, segment: str, spans: Sequence[dict[str, Any]]) -> tuple[FloatArray, float]:
@@ -210,6 +238,25 @@ def _table(stretch: Stretch, segment: str) -> tuple[Any, FloatArray]:
     values = table.select(IMU_COLUMNS).to_numpy()
     good = np.isfinite(values).all(axis=1) & np.r_[True, np.diff(np.maximum.accumulate(t)) > 0]
     return t[good], values[good]
+
+
+def unbroken(
+    pairs: Sequence[tuple[tuple[Any, FloatArray], tuple[Any, FloatArray]]],
+) -> list[vectorfit.Span]:
+    """Return the longest stretches of both sensors without a gap, at the upper's times; at least 3 s, at most six."""
+    found = []
+    for upper, lower in pairs:
+        t, s = upper[0].astype(np.float64) * 1e-9, lower[0].astype(np.float64) * 1e-9
+        if len(t) < 5 or len(s) < 5:
+            continue
+        k = np.clip(np.searchsorted(s, t), 1, len(s) - 1)
+        good = (t >= s[0]) & (t <= s[-1]) & (s[k] - s[k - 1] < 0.1)
+        other = np.stack([np.interp(t, s, lower[1][:, c]) for c in range(6)], axis=1)
+        broken = np.flatnonzero((np.diff(t) > 0.1) | (good[1:] != good[:-1])) + 1
+        for part in np.split(np.arange(len(t)), broken):
+            if len(part) > 20 and good[part[0]] and t[part[-1]] - t[part[0]] >= 3.0:
+                found.append(vectorfit.Span(t[part] - t[part[0]], upper[1][part], other[part]))
+    return sorted(found, key=lambda span: -len(span.t))[:6]
 
 
 def paired_rows(upper: tuple[Any, FloatArray], lower: tuple[Any, FloatArray]) -> tuple[FloatArray, float]:

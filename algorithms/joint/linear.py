@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from ..contract import FloatArray, IntArray
 from ..numerics.compiled import compiled
 from . import merge, selfaligned
 from .selfaligned import near
@@ -46,6 +45,14 @@ DTYPE = np.dtype(
         ("r", "f8", (ROWS,)),
         ("r_self", "f8", (2,)),  # joint row of SMeA in T and S, and in TS
         ("mount", "f8", (merge.MOST, 3, 3)),  # sensor to segment
+        ("average", "f8"),  # s; 0: every sample's force by itself
+        ("measured", "f8", (merge.MOST, 3)),  # force in the segment's frame
+        ("levelled", "f8", (merge.MOST, 3)),  # its average, levelled by the filter's own angles
+        ("averaged", "f8", (merge.MOST,)),  # s
+        ("swing", "f8", (merge.MOST,)),  # mean square of the levelled force about its average, (m/s²)²
+        ("grow", "f8"),  # growth of σ_a² with it
+        ("sigma2", "f8", (ROWS,)),  # σ² of the rows at rest
+        ("p_bias", "f8"),
         ("on_line", "i8"),
         ("started", "i8", (merge.MOST,)),
         ("theta_g", "f8", (merge.MOST, 3)),
@@ -76,7 +83,48 @@ def measure(s: Any, i: int) -> None:
     x = m[i, 0, 0] * ax + m[i, 0, 1] * ay + m[i, 0, 2] * az
     y = m[i, 1, 0] * ax + m[i, 1, 1] * ay + m[i, 1, 2] * az
     z = m[i, 2, 0] * ax + m[i, 2, 1] * ay + m[i, 2, 2] * az
-    size = math.sqrt(ax * ax + ay * ay + az * az)
+    s.measured[i, 0], s.measured[i, 1], s.measured[i, 2] = x, y, z
+    angles_of_force(s, i, x, y, z)
+
+
+@compiled
+def average(s: Any, i: int) -> None:
+    """Put the average of the levelled force in place of this sample's: what comes and goes over a stride is gone.
+
+    The force is turned by the filter's own roll and pitch, averaged over ``s.average`` s, and turned back: linear,
+    so that accelerations without a mean leave no error in the angles (not in the source; after Laidig and Seel
+    2023). The variance about that average says how far the accelerometer can be trusted now.
+    """
+    a, b = 0.0, 0.0
+    if s.axes == 3:
+        a, b = s.theta_g[i, 0] + s.x[6 * i], s.theta_g[i, 1] + s.x[6 * i + 2]
+    elif s.flex == 0:
+        a = s.theta_g[i, 0] + s.x[2 * i]
+    else:
+        b = s.theta_g[i, 0] + s.x[2 * i]
+    ca, sa, cb, sb = math.cos(a), math.sin(a), math.cos(b), math.sin(b)
+    x, y, z = s.measured[i, 0], s.measured[i, 1], s.measured[i, 2]
+    up = sa * y + ca * z
+    lx, ly, lz = cb * x + sb * up, ca * y - sa * z, cb * up - sb * x
+    s.averaged[i] += s.dt
+    w = min(1.0, s.dt / max(1e-9, min(s.average, s.averaged[i])))
+    s.levelled[i, 0] += w * (lx - s.levelled[i, 0])
+    s.levelled[i, 1] += w * (ly - s.levelled[i, 1])
+    s.levelled[i, 2] += w * (lz - s.levelled[i, 2])
+    off = (lx - s.levelled[i, 0]) ** 2 + (ly - s.levelled[i, 1]) ** 2 + (lz - s.levelled[i, 2]) ** 2
+    s.swing[i] += w * (off - s.swing[i])
+    for k in range(s.axes):
+        m = i * s.axes + k
+        s.r[m] = s.sigma2[m] + s.grow * s.swing[i] / (s.gravity * s.gravity)
+    lx, ly, lz = s.levelled[i, 0], s.levelled[i, 1], s.levelled[i, 2]
+    up = sb * lx + cb * lz
+    angles_of_force(s, i, cb * lx - sb * lz, ca * ly + sa * up, ca * up - sa * ly)
+
+
+@compiled
+def angles_of_force(s: Any, i: int, x: float, y: float, z: float) -> None:
+    """Write θ_a, ρ and whether it is usable for a force in the segment's frame (eqs 8, 28)."""
+    size = math.sqrt(x * x + y * y + z * z)
     s.rho[i] = abs(size - s.gravity)
     s.usable[i] = 1 if s.rho[i] <= s.zeta else 0
     roll = math.atan2(y, z)
@@ -145,8 +193,9 @@ def integrate(s: Any, i: int) -> None:
 
 @compiled
 def restart(s: Any, i: int) -> None:
-    """Begin segment ``i``: θ_g from its accelerometer, x = 0, P = I."""
+    """Begin segment ``i``: θ_g from its accelerometer, x = 0, P = I (of the bias: ``p_bias``)."""
     n = 2 * s.n * s.axes
+    s.averaged[i], s.swing[i] = 0.0, 0.0
     for k in range(s.axes):
         s.theta_g[i, k] = s.theta_a[i, k]
     for a in range(2 * i * s.axes, 2 * (i + 1) * s.axes):
@@ -154,7 +203,7 @@ def restart(s: Any, i: int) -> None:
         for b in range(n):
             s.P[a, b] = 0.0
             s.P[b, a] = 0.0
-        s.P[a, a] = 1.0
+        s.P[a, a] = 1.0 if a % 2 == 0 else s.p_bias
     s.started[i] = 1
 
 
@@ -332,6 +381,10 @@ def step(s: Any) -> bool:
         elif s.valid[i] == 1:
             integrate(s, i)
     predict(s)
+    if s.average > 0.0:
+        for i in range(s.n):
+            if s.valid[i] == 1:
+                average(s, i)
     select(s)
     form(s)
     correct(s)
@@ -355,136 +408,3 @@ def begin_alpha(s: Any) -> None:
     if s.gap[0] > 0.0 or s.gap[1] > 0.0:
         s.alpha_on = 0
     selfaligned.joint_angle(s)
-
-
-@compiled
-def share(s: Any, a: int, i: int, weighted: bool) -> float:
-    """Return the part of state ``a``'s correction that comes from rows other than segment ``i``'s accelerometer."""
-    own, other = 0.0, 0.0
-    for m in range(s.n * s.axes + s.n - 1):
-        k = abs(s.K[a, m] * s.nu[m]) if weighted else abs(s.K[a, m])
-        if m < s.n * s.axes and m // s.axes == i:
-            own += k
-        else:
-            other += k
-    return other / (own + other) if own + other > 0.0 else math.nan
-
-
-@compiled
-def emit(s: Any, out: FloatArray) -> None:
-    """Write the results in the order of :func:`..joint.source.outputs_of`."""
-    axes, flex = s.axes, s.flex if s.axes == 3 else 0
-    shown = axes if axes == 1 or s.yaw == 1 else 2
-    joints = s.n * axes
-    for c in range(out.shape[0]):
-        out[c] = math.nan
-    at = 0
-    for j in range(s.n - 1):
-        a, b = j * axes + flex, (j + 1) * axes + flex
-        if s.valid[j] == 1 and s.valid[j + 1] == 1:
-            out[at] = s.theta_g[j, flex] + s.x[2 * a] - s.theta_g[j + 1, flex] - s.x[2 * b]
-        at += 1
-    for part in range(3):  # angles, standard deviations, biases
-        if part == 1:
-            for j in range(s.n - 1):
-                a, b = 2 * (j * axes + flex), 2 * ((j + 1) * axes + flex)
-                if s.valid[j] == 1 and s.valid[j + 1] == 1:
-                    out[at] = math.sqrt(max(0.0, s.P[a, a] + s.P[b, b] - 2.0 * s.P[a, b]))
-                at += 1
-        for i in range(s.n):
-            for k in range(shown):
-                a = 2 * (i * axes + k)
-                if s.valid[i] == 1:
-                    if part == 0:
-                        out[at] = s.theta_g[i, k] + s.x[a]
-                    elif part == 1:
-                        out[at] = math.sqrt(max(0.0, s.P[a, a]))
-                    else:
-                        out[at] = -s.x[a + 1]
-                at += 1
-    out[at] = s.jump
-    at += 1
-    for i in range(s.n):
-        if s.valid[i] == 1:
-            out[at] = s.rho[i]
-        at += 1
-    for i in range(s.n):
-        used = 0
-        for k in range(axes):
-            used = max(used, s.use[i * axes + k])
-        out[at] = used
-        at += 1
-    for j in range(s.n - 1):
-        out[at] = s.use[joints + j]
-        at += 1
-    for i in range(s.n):  # gains of the flexion angles
-        a = 2 * (i * axes + flex)
-        for h in range(s.n):
-            out[at] = s.K[a, h * axes + flex]
-            at += 1
-        for j in range(s.n - 1):
-            out[at] = s.K[a, joints + j]
-            at += 1
-    for i in range(s.n):
-        for k in range(shown):
-            a = 2 * (i * axes + k)
-            out[at] = share(s, a, i, False)
-            out[at + 1] = share(s, a, i, True)
-            at += 2
-    if s.kind == SELF:
-        if s.alpha_on == 1:
-            out[at], out[at + 1], out[at + 2] = s.alpha, s.alpha_acc, s.alpha_gyr
-            out[at + 3] = math.sqrt(s.alpha_var)
-        at += 4
-        for i in range(2):
-            for m in range(3):
-                if s.known == 1:
-                    out[at] = s.axis[i, m]
-                at += 1
-
-
-@compiled
-def drain(s: Any, out: FloatArray) -> bool:
-    """Filter the next sample that is due, if any; write its results."""
-    while merge.advance(s):
-        if step(s):
-            emit(s, out)
-            return True
-    return False
-
-
-@compiled
-def run(
-    state: Any,
-    inputs: IntArray,
-    channels: IntArray,
-    t_ns: IntArray,
-    values: FloatArray,
-    out_message: IntArray,
-    out_t_ns: IntArray,
-    out_values: FloatArray,
-) -> int:
-    """Take merged messages; see :class:`..contract.KernelEstimator`."""
-    s = state[0]
-    count = 0
-    for m in range(t_ns.shape[0]):
-        merge.push(s, inputs[m], t_ns[m], values[m])
-        for _ in range(2):
-            if not drain(s, out_values[count]):
-                break
-            out_message[count] = m
-            out_t_ns[count] = s.now
-            count += 1
-    return count
-
-
-@compiled
-def run_end(state: Any, out_t_ns: IntArray, out_values: FloatArray) -> int:
-    """Give what is held back."""
-    s = state[0]
-    s.ending = 1
-    count = 0
-    while count < out_t_ns.shape[0] and drain(s, out_values[count]):
-        out_t_ns[count] = s.now
-        count += 1
-    return count

@@ -8,11 +8,22 @@ import numpy as np
 
 from ..contract import AlgorithmError, Context, Input, Output, Remark
 from ..parameters import meta
-from . import linear, selfaligned
+from . import linear, linear_loop, selfaligned
 from .common import JointEstimator, MergeParams, encoder, imu, mounts
 
 TABLE5 = "table 5"
 AXES = ("roll", "pitch", "yaw")
+TUNED: dict[str, Any] = {
+    "integration": "quaternion",
+    "average_s": 1.0,
+    "sigma2_acc_thigh": 0.02,
+    "sigma2_acc_shank": 0.02,
+    "grow_acc": 5.0,
+    "sigma2_joint": 1e-3,
+    "sigma2_start_bias": 1e-3,
+    "zeta": 1.0,
+}
+"""For walking at any pace: the force is averaged over a stride, the joint row and the gyroscope's bias are trusted."""
 NAMED = "marcha_msgs/msg/NamedValues"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
@@ -41,6 +52,28 @@ class FilterParams(MergeParams, frozen=True, forbid_unknown_fields=True, kw_only
             ge=0.0,
         ),
     ] = 0.5
+    average_s: Annotated[
+        float,
+        meta(
+            "Time over which the levelled force is averaged before its angles and norm are taken; 0: every sample",
+            "s",
+            "ours: 0 as in the source",
+            ge=0.0,
+            le=60.0,
+        ),
+    ] = 0.0
+    grow_acc: Annotated[
+        float,
+        meta(
+            "Growth of σ_a² with the variance of the levelled force over average_s, in g²",
+            "1",
+            "ours: 0 as in the source",
+            ge=0.0,
+        ),
+    ] = 0.0
+    sigma2_start_bias: Annotated[
+        float, meta("Variance of the bias at the start", "rad²/s²", "appendix: P_0 = I", gt=0.0)
+    ] = 1.0
     unusable: Annotated[
         Literal["drop", "zero", "hold"],
         meta(
@@ -152,8 +185,8 @@ class SourceFilter(JointEstimator):
     dtype = linear.DTYPE
     kind: ClassVar[int] = linear.LOCAL
     axes: ClassVar[int] = 1
-    run = staticmethod(linear.run)
-    run_end = staticmethod(linear.run_end)
+    run = staticmethod(linear_loop.run)
+    run_end = staticmethod(linear_loop.run_end)
 
     def set_up(self, context: Context) -> None:
         """Write parameters into the state and set ``outputs``."""
@@ -165,13 +198,14 @@ class SourceFilter(JointEstimator):
         s["integration"] = ("axis", "euler", "quaternion").index(getattr(p, "integration", "axis"))
         s["unusable"] = ("drop", "zero", "hold").index(p.unusable)
         s["dynamic"] = getattr(p, "rule", "norm") == "dynamic"
+        s["average"], s["grow"], s["p_bias"] = p.average_s, p.grow_acc, p.sigma2_start_bias
         s["zeta"], s["gravity"], s["decay"] = p.zeta, p.gravity, 1.0 / p.tau_s
         s["q"] = p.sigma2_gyr, p.sigma2_bias
         r = np.ones(linear.ROWS)
         for i, segment in enumerate(self.segments):
             r[i * self.axes : (i + 1) * self.axes] = getattr(p, f"sigma2_acc_{segment}", p.sigma2_acc_thigh)
         r[n * self.axes : n * self.axes + n - 1] = getattr(p, "sigma2_joint", 0.5)
-        s["r"] = r
+        s["r"] = s["sigma2"] = r
         s["mount"][:n] = mounts(p, self.segments, context)
         self.outputs = outputs_of(self)
 
@@ -198,7 +232,7 @@ class SourceFilter(JointEstimator):
 
 
 def outputs_of(estimator: SourceFilter) -> tuple[Output, ...]:
-    """Return the outputs of a filter for its segments, in the order of :func:`.linear.emit`."""
+    """Return the outputs of a filter for its segments, in the order of :func:`.linear_loop.emit`."""
     segments, joints = estimator.segments, estimator.joint_names()
     yaw = getattr(estimator.params, "yaw", "none") == "acc-tilt"
     shown = AXES[: 3 if yaw else 2] if estimator.axes == 3 else (estimator.params.flexion,)
@@ -297,7 +331,7 @@ class JointSme(SourceFilter):
     title: ClassVar[str] = "Markov-jump filter with encoders, roll, pitch, yaw (SMe)"
     source: ClassVar[str] = "joint dissertation, eqs 38–67, tables 2 and 3"
     Params = SpatialEncoderParams
-    presets: ClassVar[dict[str, dict[str, Any]]] = {"tuned": {"sigma2_joint": 1e-4, "zeta": 0.5}}
+    presets: ClassVar[dict[str, dict[str, Any]]] = {"tuned": TUNED}
     kind: ClassVar[int] = linear.ONE
     axes: ClassVar[int] = 3
     least = 2
@@ -326,12 +360,7 @@ class JointSmea(SourceFilter):
     source: ClassVar[str] = "joint dissertation, eqs 68–84, table 4"
     Params = SmeaParams
     presets: ClassVar[dict[str, dict[str, Any]]] = {
-        "tuned": {
-            "sigma2_joint": 1e-3,
-            "sigma2_acc_thigh": 0.02,
-            "sigma2_acc_shank": 0.02,
-            "sigma2_alpha": 0.01,
-        }
+        "tuned": {**TUNED, "sigma2_joint": 1e-2, "sigma2_alpha": 1e-2}
     }
     kind: ClassVar[int] = linear.SELF
     axes: ClassVar[int] = 3
