@@ -22,7 +22,7 @@ from pympi.Praat import TextGrid
 
 from .annotation_samples import START_NS, hard_annotations, recording
 
-COUNT = 3_000
+COUNT = 10_000
 RESOLUTION = {"audacity": 1_000, "eaf": 1_000_000, "textgrid": 1}
 
 
