@@ -194,13 +194,13 @@ def remove(
         All annotations of this tier.
     """
     from .. import recording
-    from ..recording.changes import find
+    from ..recording.changes import find, find_tier
     from ..recording.errors import UsageError
 
     rec = recording.open(path)
     gone = find(rec, ids)
     if tier is not None:
-        gone += rec.annotations.filter(tier=tier)["id"].to_list()
+        gone += rec.annotations.filter(tier=find_tier(rec, tier))["id"].to_list()
     if not gone:
         raise UsageError(f"{path}: annotate remove: nothing is named; give ids or --tier of what is there")
     return write(rec, where, remove=tuple(dict.fromkeys(gone)), action="remove")
@@ -353,6 +353,7 @@ def export(
     from .. import recording
     from ..export.labels import WRITTEN
     from ..recording.annotations import TOPIC
+    from ..recording.changes import find_tier
     from ..recording.errors import UsageError
     from .export import hand_on
 
@@ -362,7 +363,11 @@ def export(
         known = ", ".join(endings.values())
         raise UsageError(f"{output}: {name or output.suffix!r} is no format of labels; give --to {known}")
     options: dict[str, Any] = {"topics": tuple(TOPIC + t for t in tier)} if tier else {}
-    return hand_on(recording.open(path), name, output, options, force=force)
+    rec = recording.open(path)
+    for one in tier:
+        if not any(mark in one for mark in "*?["):
+            find_tier(rec, one)
+    return hand_on(rec, name, output, options, force=force)
 
 
 @app.command(name="list")
@@ -377,13 +382,14 @@ def list_(path: Path, /, *, tier: Tier = None, common: Common = DEFAULT) -> Outc
         Only this tier.
     """
     from .. import recording
+    from ..recording.changes import find_tier
     from ..recording.events import to_events
 
     rec = recording.open(path)
     events = to_events(rec.annotations, rec.start_ns)
     say_losses(rec)
     if tier is not None:
-        events = events.filter(tier=tier)
+        events = events.filter(tier=find_tier(rec, tier))
     rows = events.rows(named=True)
     optional = [c for c in ("source", "confidence", "note", "channel") if events[c].null_count() < len(rows)]
     table = TextTable(

@@ -260,6 +260,7 @@ def diff(
     from .. import recording
     from ..export.agreement import compare
     from ..export.labels import read_labels
+    from ..recording.changes import find_tier
     from ..recording.errors import UsageError
     from .options import span_ns
 
@@ -275,6 +276,8 @@ def diff(
     table = other.annotations if is_recording else table
     one, two = rec.annotations, table
     if tiers:
+        if not two.filter(tier=tiers[1]).height:  # an annotator may have found nothing in a tier of the first
+            find_tier(rec, tiers[0])
         one, two = one.filter(tier=tiers[0]), two.filter(tier=tiers[1])
     for name, rows in zip(tiers or ["annotations"] * 2, (one, two), strict=True):
         if not rows.height:

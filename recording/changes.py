@@ -287,34 +287,94 @@ def _new(rec: Recording, kept: pl.DataFrame, add: pl.DataFrame | None) -> pl.Dat
     return identified(both)[kept.height :]
 
 
-def check_inside(rec: Recording, annotations: pl.DataFrame) -> None:
-    """Raise ``MarchaError`` where an annotation does not lie inside the recording's data."""
+def check_inside(
+    rec: Recording, annotations: pl.DataFrame, where: Path | None = None, *, lines: bool = False
+) -> None:
+    """Raise ``MarchaError`` where an annotation does not lie inside the recording's data.
+
+    Parameters
+    ----------
+    rec : Recording
+        What they speak of.
+    annotations : polars.DataFrame
+        To be checked.
+    where : Path, optional
+        File that they come from; named instead of the recording.
+    lines : bool
+        Whether that is a table with a header and a line an annotation, so that the line is named.
+    """
     span = rec.data_span
     if span is None:
         return
     first, last = span
-    outside = annotations.filter((pl.col("start_ns") < first) | (pl.col("end_ns") > last))
-    if outside.height:
-        row = outside.row(0, named=True)
+    outside = (annotations["start_ns"] < first) | (annotations["end_ns"] > last)
+    if outside.any():
+        row = annotations.row(outside.arg_true()[0], named=True)
         start, end = ((row[k] - rec.start_ns) / 1e9 for k in ("start_ns", "end_ns"))
         raise MarchaError(
-            f"{rec.path}: {outside.height} of {annotations.height} annotations lie outside of the recording "
-            f"(0 to {(last - rec.start_ns) / 1e9:.3f} s): {row['label']!r} from {start:.3f} to {end:.3f} s; "
-            "correct its times, or give its clock's offset"
+            f"{_place(where or rec.path, outside, lines)}: {outside.sum()} of {annotations.height} annotations "
+            f"lie outside of the recording (0 to {(last - rec.start_ns) / 1e9:.3f} s): {row['label']!r} from "
+            f"{start:.3f} to {end:.3f} s; correct its times, or give its clock's offset"
         )
 
 
-def check_labels(where: Path, annotations: pl.DataFrame, known: Mapping[str, Vocabulary]) -> None:
-    """Raise ``MarchaError`` where a tier has a closed vocabulary and a label is not in it."""
+def check_labels(
+    where: Path, annotations: pl.DataFrame, known: Mapping[str, Vocabulary], *, lines: bool = False
+) -> None:
+    """Raise ``MarchaError`` where a tier has a closed vocabulary and a label is not in it.
+
+    Parameters
+    ----------
+    where : Path
+        File that the annotations come from.
+    annotations : polars.DataFrame
+        To be checked.
+    known : mapping
+        Tier to its vocabulary.
+    lines : bool
+        See :func:`check_inside`.
+    """
     for tier, vocabulary in known.items():
         if not vocabulary.closed:
             continue
-        odd = annotations.filter((pl.col("tier") == tier) & ~pl.col("label").is_in(list(vocabulary.labels)))
-        if odd.height:
+        odd = (annotations["tier"] == tier) & ~annotations["label"].is_in(list(vocabulary.labels))
+        if odd.any():
+            label = annotations["label"][int(odd.arg_true()[0])]
             raise MarchaError(
-                f"{where}: tier {tier!r}: label {odd['label'][0]!r} is not in its closed vocabulary; "
+                f"{_place(where, odd, lines)}: tier {tier!r}: label {label!r} is not in its closed vocabulary; "
                 f"it has {', '.join(vocabulary.labels) or 'none'}"
             )
+
+
+def check_unique(where: Path, annotations: pl.DataFrame, *, lines: bool = False) -> None:
+    """Raise ``MarchaError`` where an id is there twice; parameters as :func:`check_labels` has them."""
+    twice = annotations["id"].is_not_null() & annotations["id"].is_duplicated()
+    if twice.any():
+        name = annotations["id"][int(twice.arg_true()[0])]
+        again = twice & (annotations["id"] == name)
+        again[int(again.arg_true()[0])] = False
+        raise MarchaError(
+            f"{_place(where, again, lines)}: id {name!r} is there twice; give each annotation its own"
+        )
+
+
+def _place(where: Path, odd: pl.Series, lines: bool) -> str:
+    """Return the file, and where it is a table the line of the first odd row."""
+    return f"{where}: line {odd.arg_true()[0] + 2}" if lines else str(where)
+
+
+def find_tier(rec: Recording, tier: str) -> str:
+    """Return the tier.
+
+    Raises
+    ------
+    UsageError
+        No annotation is of it and it has no vocabulary.
+    """
+    known = {*rec.annotations["tier"].unique(), *rec.metadata.get(VOCABULARY, {})}
+    if tier not in known:
+        raise UsageError(f"{rec.path}: no tier {tier!r}; it has {', '.join(sorted(known)) or 'none'}")
+    return tier
 
 
 def _vocabulary(rec: Recording, new: Mapping[str, Vocabulary | None]) -> dict[str, str]:

@@ -9,9 +9,10 @@ from typing import NamedTuple
 import polars as pl
 
 from ...recording import Recording
-from ...recording.changes import check_inside
+from ...recording.changes import check_inside, check_labels, check_unique
 from ...recording.errors import UsageError
 from ...recording.event_table import read_events
+from ...recording.events import vocabularies
 from ...recording.files import read_small
 from . import audacity, c3d, elan, textgrid
 from .side import annotations_of
@@ -58,7 +59,8 @@ def read_labels(
     Raises
     ------
     MarchaError
-        The file is broken, or a label lies outside of the recording.
+        The file is broken, a label lies outside of the recording or does not fit its tier's closed vocabulary, or an
+        id is there twice.
     UsageError
         An unknown format.
     """
@@ -74,7 +76,10 @@ def read_labels(
     table, reach = _within(rec, table)
     if reach:
         notes.append(f"{reach} labels reached less than 1 ms over an end of the recording and were cut there")
-    check_inside(rec, table)
+    lines = name == TABLE
+    check_unique(path, table, lines=lines)
+    check_inside(rec, table, path, lines=lines)
+    check_labels(path, table, vocabularies(rec.metadata), lines=lines)
     return Labels(name, table, notes)
 
 
