@@ -37,6 +37,7 @@ def convert(
     format: str | None = None,
     mapping: Annotated[Path | None, Parameter(name="--map")] = None,
     option: Annotated[Strings, Parameter(name="--set")] = (),
+    truth: Strings = (),
     strict: bool = False,
     force: Force = False,
     common: Common = DEFAULT,
@@ -61,7 +62,9 @@ def convert(
     mapping : Path
         TOML mapping for the format table: columns, units, time, frames.
     option : str
-        key=value of the format or of the walk (closed=true, length_m=22.1); may be repeated.
+        key=value of the format (marcha formats lists them); may be repeated.
+    truth : str
+        What is known of the walk: closed=true, length_m=22.1, steps=63; may be repeated.
     strict : bool
         Fail where something would have to be repaired or dropped.
     force : bool
@@ -75,6 +78,7 @@ def convert(
         "format": format,
         "mapping": mapping,
         "options": settings(option, "--set"),
+        "truth": settings(truth, "--truth"),
         "strict": strict,
         "overwrite": force,
     }

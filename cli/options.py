@@ -83,7 +83,7 @@ def settings(pairs: tuple[str, ...], option: str) -> dict[str, str]:
         key = key.strip()
         if not sign or not key:
             raise UsageError(
-                f"{option} {pair}: is not of the form key=value, for example {option} closed=true"
+                f"{option} {pair}: is not of the form key=value, for example {option} rate_hz=100"
             )
         if found.setdefault(key, value.strip()) != value.strip():
             raise UsageError(

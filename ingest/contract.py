@@ -26,13 +26,6 @@ class CommonOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
     ``convert`` acts on these fields itself; an importer needs not look at them.
     """
 
-    closed: Annotated[
-        bool | None, msgspec.Meta(description="the walk ends where it began (truth for the closure metric)")
-    ] = None
-    length_m: Annotated[
-        Annotated[float, msgspec.Meta(gt=0)] | None,
-        msgspec.Meta(description="true length of the walk in metres, where it is known"),
-    ] = None
     epoch: Annotated[
         str | None,
         msgspec.Meta(description="UTC time (ISO 8601) of the device clock's zero; makes the clock UTC"),

@@ -30,7 +30,7 @@ from .floor import Floor, kind_of, read_floor
 from .legchecks import LegWatch
 from .mapping import mapping_format
 from .radio import RadioWatch, addresses
-from .truth import TruthFile, as_text, read_truth
+from .truth import WALK_FACTS, TruthFile, as_text, read_truth, walk_facts
 
 T = TypeVar("T")
 
@@ -65,6 +65,7 @@ def convert(
     format: str | None = None,
     mapping: Path | str | None = None,
     options: Mapping[str, Any] | None = None,
+    truth: Mapping[str, Any] | None = None,
     strict: bool = False,
     overwrite: bool = False,
     progress: Callable[[int], None] | None = None,
@@ -86,6 +87,9 @@ def convert(
     options : mapping, optional
         The format's options (``marcha formats``), values also as text; of several formats
         ``format.option`` names one.
+    truth : mapping, optional
+        What is known of the walk: ``closed``, ``length_m`` (m), ``steps`` …; goes into the metadata record
+        ``truth``, before what a side file says. ``closed`` and ``length_m`` may stand among the options too.
     strict : bool
         Fail where a row would be dropped or repaired.
     overwrite : bool
@@ -105,6 +109,7 @@ def convert(
         if any(path.resolve() == earlier.resolve() for earlier in sources[:k]):
             raise UsageError(f"{path}: given twice; name each input once")
     sources, beside = _apart(sources)
+    facts_of_walk = walk_facts({k: chosen.pop(k) for k in WALK_FACTS if k in chosen} | dict(truth or {}))
     place = {k.removeprefix("plan."): chosen.pop(k) for k in list(chosen) if k.startswith("plan.")}
     mapped = None
     if mapping is not None:
@@ -125,26 +130,26 @@ def convert(
         settings = registry.share_options(found, chosen)
         told = ReportBuilder()
         floor = read_floor(beside, place, told)
-        truths = [read_truth(source.files[0]) for source in found]
+        side_files = [read_truth(source.files[0]) for source in found]
         facts = {
             "importer": ", ".join(dict.fromkeys(r.importer.name for r, _ in found)),
             "importer_version": ", ".join(dict.fromkeys(r.source for r, _ in found)),
-            "options": chosen | {f"plan.{k}": v for k, v in place.items()},
+            "options": chosen | facts_of_walk | {f"plan.{k}": v for k, v in place.items()},
             "given": ", ".join(as_unicode(p.name) for p in (*sources, *beside)),
         }
         read = [
-            p for (_, files), truth in zip(found, truths, strict=True) for p in _read(files, truth)
+            p for (_, files), side in zip(found, side_files, strict=True) for p in _read(files, side)
         ] + beside
         origin = stack.enter_context(helpers("hash", 1)).submit(provenance, read, **facts)
         try:
             with mr.create(out, overwrite=overwrite) as recording:
-                merged = _Merged(len(found), floor)
+                merged = _Merged(len(found), floor, facts_of_walk)
                 written = _Writer(recording, progress)
-                for source, setting, truth in zip(found, settings, truths, strict=True):
+                for source, setting, side in zip(found, settings, side_files, strict=True):
                     imported = source.registered.importer.read(source.files, setting)
                     if strict:
                         imported.refuse_changes(source.files[0])
-                    merged.add(source, setting, truth, imported, written)
+                    merged.add(source, setting, side, imported, written)
                 report = merged.report(told.build())
                 for name, record in (merged.records(report) | {"provenance": origin.result()}).items():
                     recording.add_metadata(name, record)
@@ -161,8 +166,9 @@ def convert(
 class _Merged:
     """What the sources of one recording say: their channels, reports, metadata and attachments."""
 
-    def __init__(self, count: int, floor: Floor) -> None:
+    def __init__(self, count: int, floor: Floor, facts: dict[str, str]) -> None:
         self._several = count > 1
+        self._facts = facts
         self._floor = floor
         self._reports: list[tuple[str, Report]] = []
         self._records: dict[str, dict[str, str]] = {"plan": floor.metadata} if floor.metadata else {}
@@ -225,6 +231,8 @@ class _Merged:
     def records(self, report: Report) -> dict[str, dict[str, str]]:
         """Return all metadata records but the provenance."""
         records = dict(self._records)
+        if self._facts:
+            records["truth"] = records.get("truth", {}) | self._facts
         if len(set(self._clocks.values())) > 1:
             records["clocks"] = self._clocks
         keys = ("rows_read", "rows_kept", "rows_repaired", "rows_dropped")
@@ -354,12 +362,8 @@ def _metadata(
     records = {name: dict(record) for name, record in imported.metadata.items()}
     if options.epoch is not None or options.start is not None:
         records.setdefault("device", {})["clock"] = "utc"
-    known = dict(truth.metadata) if truth else {}
-    for key in ("closed", "length_m"):
-        if (value := getattr(options, key)) is not None:
-            known[key] = as_text(value)
-    if known:
-        records["truth"] = records.get("truth", {}) | known
+    if truth and truth.metadata:
+        records["truth"] = records.get("truth", {}) | truth.metadata
     return records
 
 

@@ -12,14 +12,16 @@ the foot is still; it becomes ``/reference/pose``, ``/reference/velocity`` and `
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import polars as pl
 
-from ..recording.errors import MarchaError
+from ..recording.errors import MarchaError, UsageError
 from ..recording.files import read_toml
 from .contract import ChannelSpec
 
@@ -33,6 +35,39 @@ SCHEMAS = (
     ("velocity", "geometry_msgs/msg/Vector3Stamped", VELOCITY),
     ("stance", "marcha_msgs/msg/Stance", ("still",)),
 )
+
+
+WALK_FACTS = ("closed", "length_m")
+"""Facts of a walk that ``convert --set`` takes as well: as truth, whatever the format."""
+
+
+def walk_facts(given: Mapping[str, Any]) -> dict[str, str]:
+    """Return what a user knows of a walk, as text.
+
+    Parameters
+    ----------
+    given : mapping
+        ``closed`` (true or false), ``length_m`` (m), ``steps`` and other facts by name.
+
+    Raises
+    ------
+    UsageError
+        ``closed`` is neither true nor false, or ``length_m`` or ``steps`` is no positive number.
+    """
+    facts = {name: as_text(value).strip() for name, value in given.items()}
+    for name, text in facts.items():
+        if name == "closed":
+            facts[name] = text.lower()
+            if text.lower() not in ("true", "false"):
+                raise UsageError(f"truth closed={text!r}: is neither true nor false")
+        elif name in ("length_m", "steps"):
+            try:
+                good = 0 < float(text) < math.inf
+            except ValueError:
+                good = False
+            if not good:
+                raise UsageError(f"truth {name}={text!r}: is no positive number")
+    return facts
 
 
 class TruthFile(msgspec.Struct, frozen=True):

@@ -17,7 +17,7 @@ from .alignment import IntArray
 from .gaitcycles import JointCycles, cycles
 from .metrics import available_metrics
 from .metrics_joint import doubts
-from .references import KINDS, reference_of, references
+from .references import KINDS, references, track_reference
 from .trajectory import joined
 from .view import RunView, Truth
 
@@ -322,9 +322,7 @@ def usual_alignment(rec: Recording | None, lineage: Mapping[str, str], track: st
 
 def _track_references(rec: Recording, input_topic: str, chosen: str | None) -> tuple[str | None, str | None]:
     """Return the topics of the reference track (poses before positions) and of the velocity beside it."""
-    track = reference_of(rec.channels, "pose", input_topic, chosen, str(rec.path))
-    if track is None:
-        track = reference_of(rec.channels, "position", input_topic, chosen, str(rec.path))
+    track = track_reference(rec.channels, input_topic, chosen, str(rec.path))
     if track is None:
         return None, None
     beside = track.rpartition("/")[0] + "/velocity"

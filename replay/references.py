@@ -79,3 +79,41 @@ def reference_of(
     if len(fitting) > 1:
         raise UsageError(f"{name}: several references ({', '.join(fitting)}) for {input_topic}; name one")
     return fitting[0] if fitting else None
+
+
+def track_reference(
+    channels: Mapping[str, _Channel],
+    input_topic: str,
+    chosen: str | None = None,
+    name: str = "",
+    kinds: tuple[str, ...] = ("pose", "position"),
+) -> str | None:
+    """Return the topic of the positions that a run's track is compared with: poses before positions.
+
+    See :func:`reference_of`.
+    """
+    found = (reference_of(channels, kind, input_topic, chosen, name) for kind in kinds)
+    return next((topic for topic in found if topic is not None), None)
+
+
+def shown_reference(
+    channels: Mapping[str, _Channel], run: str, records: Mapping[str, Mapping[str, str]]
+) -> str | None:
+    """Return the reference that a picture shows beside a run, by the run's own record of its input.
+
+    Where several fit and none is called like the input, the evaluation asks which; a picture shows the first.
+
+    Parameters
+    ----------
+    channels : mapping
+        Of the recording, by topic.
+    run : str
+        Id of the run; empty for a recording without runs.
+    records : mapping
+        Metadata records of the recording.
+    """
+    input_topic = records.get(f"run/{run}", {}).get("input", "")
+    try:
+        return track_reference(channels, input_topic)
+    except UsageError:
+        return next(t for kind in ("pose", "position") for t in references(channels, kind))

@@ -183,7 +183,7 @@ def _truth(rec: Recording, length_m: float | None, closed: bool | None) -> Truth
     truth = Truth(own.closed if closed is None else closed, own.length_m if length_m is None else length_m)
     if not truth.length_m or not truth.length_m > 0:
         raise UsageError(
-            f"{rec.path}: the walk's length is not known; give length_m, or convert with --set length_m=22.1"
+            f"{rec.path}: the walk's length is not known; give length_m, or convert with --truth length_m=22.1"
         )
     return truth
 

@@ -100,7 +100,7 @@ class StudyCell(msgspec.Struct, frozen=True):
 
 def cached(source: StudyRecording, folder: Path) -> Path:
     """Return where the recording of ``source`` is, or will be once it is converted."""
-    if source.kind == "mcap" and not source.options:
+    if source.kind == "mcap" and not source.truth:
         return Path(source.path)
     return folder / f"{source.name.replace('/', '__')}-{source.digest[:8]}.mcap"
 
@@ -162,7 +162,7 @@ def prepare(source: StudyRecording, folder: Path) -> Path:
         elif source.kind == "raw":
             from ..ingest import convert
 
-            convert([source.path], path, format=source.format, options=source.options)
+            convert([source.path], path, format=source.format, options=source.options, truth=source.truth)
         else:
             _simulate(source, path)
     return path
@@ -171,7 +171,7 @@ def prepare(source: StudyRecording, folder: Path) -> Path:
 def _with_truth(source: StudyRecording, path: Path) -> None:
     """Copy a recording and add what the study knows about its walk."""
     rec = open_recording(source.path)
-    truth = {k: str(v).lower() if isinstance(v, bool) else str(v) for k, v in source.options.items()}
+    truth = {k: str(v).lower() if isinstance(v, bool) else str(v) for k, v in source.truth.items()}
     with create_recording(path) as out:
         out.copy_from(rec)
         out.add_metadata("truth", {**truth, **rec.metadata.get("truth", {})})

@@ -41,7 +41,9 @@ class StudyRecording(msgspec.Struct, frozen=True):
     format : str or None
         Importer of a raw file.
     options : dict
-        Options of the importer (truth included) or of the simulator.
+        Options of the importer or of the simulator.
+    truth : dict
+        What the study knows of the walk.
     scenario, seed : str, int
         What to simulate.
     configuration : str
@@ -57,6 +59,7 @@ class StudyRecording(msgspec.Struct, frozen=True):
     path: str = ""
     format: str | None = None
     options: dict[str, Any] = {}
+    truth: dict[str, Any] = {}
     scenario: str = ""
     seed: int = 0
     configuration: str = ""
@@ -207,15 +210,16 @@ def _source(recordings: cfg.Recordings, name: str, path: Path, code: str) -> Stu
         cfg.TruthRule() if beside else cfg.truth(recordings, path.name)
     )  # what a walk knows of itself counts
     truth = {k: v for k, v in (("closed", known.closed), ("length_m", known.length_m)) if v is not None}
-    options = {**truth, **recordings.options} if raw else truth
+    options = recordings.options if raw else {}
     content = [file_digest(p) for p in (path, *beside)]
     return StudyRecording(
         name=name,
         kind="raw" if raw else "mcap",
-        digest=digest(content, path.name, recordings.format if raw else None, options, code),
+        digest=digest(content, path.name, recordings.format if raw else None, options, truth, code),
         path=str(path.resolve()),
         format=recordings.format if raw else None,
         options=options,
+        truth=truth,
         size=path.stat().st_size,
     )
 

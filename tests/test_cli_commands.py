@@ -118,7 +118,7 @@ def test_convert_prints_channels_and_findings(folder: Path, tmp_path: Path) -> N
 
 
 def test_convert_takes_truth_as_options(folder: Path, tmp_path: Path) -> None:
-    options = ("--set", "closed=true", "--set", "length_m=22.1")
+    options = ("--set", "closed=true", "--truth", "length_m=22.1")
     shutil.copy(raw(folder), tmp_path / "conf-3333-alone.csv")
     marcha("convert", tmp_path / "conf-3333-alone.csv", "-o", tmp_path / "a.mcap", *options)
     assert mr.open(tmp_path / "a.mcap").metadata["truth"] == {"closed": "true", "length_m": "22.1"}

@@ -209,8 +209,8 @@ def test_a_missing_folder_is_refused(tmp_path: Path) -> None:
 def test_what_a_walk_knows_of_itself_counts(tmp_path: Path) -> None:
     data = folder_of(tmp_path, "a.csv", "b.csv", "b.truth.toml")
     config = parse(MINIMAL.replace("[[", "truth = [{ length_m = 22.1 }]\n[[", 1), tmp_path)
-    options = {s.name: s.options for s in find_sources(config, data, "code")[0]}
-    assert options == {"a": {"length_m": 22.1}, "b": {}}
+    truths = {s.name: s.truth for s in find_sources(config, data, "code")[0]}
+    assert truths == {"a": {"length_m": 22.1}, "b": {}}
 
 
 @pytest.mark.parametrize("change", ["content", "code", "parameter", "truth"])

@@ -12,9 +12,11 @@ import marcha.viz as viz
 import numpy as np
 import pytest
 from marcha.recording.errors import OutputExists, UsageError
+from marcha.replay import PlannedChannel
+from marcha.replay.references import shown_reference
 from marcha.viz import style
 from marcha.viz.top_view import nice
-from marcha.viz.trace import LIMIT, Trace, axes_error, compared, framed, reference_of
+from marcha.viz.trace import LIMIT, Trace, axes_error, compared, framed
 
 from .test_viz_rrd import RUN, write_walk
 
@@ -158,12 +160,16 @@ def test_tracks_that_do_not_meet_in_time_are_not_compared() -> None:
 
 
 def test_a_run_is_compared_with_the_truth_of_its_own_sensor() -> None:
-    both = ["/reference/pose", "/reference/imu2/pose"]
-    assert reference_of("foot_9iez_foot_imu2", both) == "/reference/imu2/pose"
-    assert reference_of("foot_9iez_foot_imu2_2", both) == "/reference/imu2/pose"
-    assert reference_of("foot_9iez_foot_imu1", both) == "/reference/pose"
-    assert reference_of("foot_9iez_foot_imu", ["/reference/footprints"]) == "/reference/footprints"
-    assert reference_of("foot_9iez_foot_imu", []) is None
+    def shown(topics: tuple[str, ...], input_topic: str, label: str = "mine") -> str | None:
+        channels = {t: PlannedChannel(t, "geometry_msgs/msg/PoseStamped") for t in topics}
+        return shown_reference(channels, label, {"run/mine": {"input": input_topic}})
+
+    both = ("/reference/pose", "/reference/imu2/pose")
+    assert shown(both, "/foot/imu2") == "/reference/imu2/pose"
+    assert shown(both, "/foot/imu1") == "/reference/pose"
+    assert shown(("/reference/footprints",), "/foot/imu") == "/reference/footprints"
+    assert shown(("/reference/a/pose", "/reference/b/pose"), "/foot/imu") == "/reference/a/pose"
+    assert shown((), "/foot/imu") is None
 
 
 def test_a_track_that_ran_away_does_not_set_the_frame() -> None:

@@ -16,11 +16,12 @@ import polars as pl
 import rerun as rr
 from numpy.typing import NDArray
 
+from ..replay.references import shown_reference
 from . import style
 from .floor import FloorPlan
 from .text import printable
 from .timeaxis import TimeAxis
-from .trace import Trace, reference_of
+from .trace import Trace
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -200,13 +201,17 @@ class Canvas:
             c.topic for c in self.channels if c.topic.startswith("/reference/") and c.schema in PLACES
         ]
         # the truth of sensors that no run reads would only cover the one that matters
-        used = {reference_of(run, self.references) for run in self.runs or [""]}
+        used = {self.reference_of(run) for run in self.runs or [""]}
         wanted = {self.owner(t) for t in used if t is not None}
         self._aside = {self.owner(t) for t in self.references} - wanted
         self.colors = {run: style.run_color(first_color + i) for i, run in enumerate(self.runs)}
         self.thresholds = sorted(
             {t for c in self.channels for t in thresholds_of(c)}, key=lambda t: (t.name, t.value)
         )
+
+    def reference_of(self, run: str) -> str | None:
+        """Return the topic of the positions that a run is compared with, None where there is none."""
+        return shown_reference({c.topic: c for c in self.channels}, run, self.metadata)
 
     # -- what things are called
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..recording import Recording
 from ..recording.errors import UsageError
 from ..replay.evaluate import evaluate
+from ..replay.references import shown_reference
 from . import style
 from .canvas import PLACES, is_estimate
 from .curve import Curve
@@ -23,7 +24,7 @@ from .floor import Anchor, floor_plan, loaders_of
 from .shapes import ELLIPSE95, circle, geo_circle, metres_a_degree
 from .stride_figures import strides
 from .text import printable
-from .trace import Trace, compared, distance, reference_of
+from .trace import Trace, compared, distance
 from .views.base import role_of
 from .views.joint import difference
 
@@ -263,11 +264,12 @@ def radio(rec: Recording, fig: Figure) -> None:
 def error(rec: Recording, fig: Figure) -> None:
     """Distance to the reference over time, and its distribution; positions as they are, not aligned."""
     traces = _traces(rec)
-    references = [t for t in traces if role_of(t) == "reference"]
     found = {}
     for topic, trace in traces.items():
-        truth = reference_of(topic.split("/")[2], references) if is_estimate(topic) else None
-        result = compared(trace, traces[truth], "none") if truth else None
+        truth = (
+            shown_reference(rec.channels, topic.split("/")[2], rec.metadata) if is_estimate(topic) else None
+        )
+        result = compared(trace, traces[truth], "none") if truth in traces else None
         if result is not None:
             found[topic] = result
     _found(rec, "track with a reference", list(found))

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from ..recording import Recording
 from ..recording.atomic import AtomicFile
 from ..recording.errors import UsageError
+from ..replay.references import shown_reference
 from ..replay.view import Comparison
 from . import style
 from .text import printable
-from .trace import Trace, compared, distance, framed, reference_of
+from .trace import Trace, compared, distance, framed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -193,14 +194,19 @@ def _position_sigma(rec: Recording, run: str) -> str:
     return topic if topic in rec.channels and {*POSITION_SIGMA} <= {*rec.channels[topic].columns} else ""
 
 
+def _reference(rec: Recording, run: str) -> str | None:
+    """Return the topic of the poses that a run is compared with, None where there are none."""
+    topic = shown_reference(rec.channels, run, rec.metadata)
+    return topic if topic is not None and rec.channels[topic].schema == POSE else None
+
+
 def _walk(rec: Recording, alignment: str) -> _Walk:
     """Read every run's track, in the order of the recording, and the reference's, and compare them."""
     poses = [t for t, c in rec.channels.items() if c.schema == POSE]
     runs = [t for t in poses if t.startswith("/estimate/") and t.endswith("/pose")]
-    references = [t for t in poses if t.startswith("/reference/")]
-    truth = {t: reference_of(t.split("/")[2], references) for t in runs}
+    truth = {t: _reference(rec, t.split("/")[2]) for t in runs}
     found = {t: Trace(t.split("/")[2], style.run_color(i)) for i, t in enumerate(runs)}
-    for topic in truth.values() if runs else [reference_of("", references)]:
+    for topic in truth.values() if runs else [_reference(rec, "")]:
         if topic is not None:
             found[topic] = Trace(" ".join(topic.split("/")[1:-1]), style.REFERENCE)
     for window in rec.windows(list(found)) if found else ():
@@ -218,8 +224,8 @@ def _walk(rec: Recording, alignment: str) -> _Walk:
                 track.place, track.worst_m = result.transform, float(distance(result).max())
                 found_errors[track.owner] = result
     tracks = {found[t].owner: found[t] for t in runs if t in found}
-    seen = {t: track for t, track in found.items() if t in references}
-    return _Walk(rec, tracks, seen, found_errors, alignment)
+    beside = {t: track for t, track in found.items() if t.startswith("/reference/")}
+    return _Walk(rec, tracks, beside, found_errors, alignment)
 
 
 def _one(fig: Figure, walk: _Walk) -> None:

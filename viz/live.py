@@ -229,7 +229,12 @@ class LiveSink(Sink):
         from .top_view import log_top_view
 
         if self._scene is None:
-            self._scene = Scene(self._stream, self._plan.channels.values(), axis_from(t_ns))
+            self._scene = Scene(
+                self._stream,
+                self._plan.channels.values(),
+                axis_from(t_ns),
+                metadata={f"run/{r.run}": {"input": r.input} for r in self._plan.runs},
+            )
             self._scene.begin()
             canvas = self._scene.canvas
             log_top_view(self._stream, *extent([canvas]))  # 10 m by 10 m until more is known

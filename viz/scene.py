@@ -25,7 +25,7 @@ from .canvas import (
 )
 from .registry import views_of, warn
 from .timeaxis import TimeAxis
-from .trace import axes_error, compared, distance, reference_of
+from .trace import axes_error, compared, distance
 from .views.base import View
 from .views.common import General
 from .views.plan import draw_plan
@@ -116,7 +116,7 @@ class Scene:
         canvas = self.canvas
         for path, trace in canvas.traces.items():
             _, mark, rest = path.partition("/run/")
-            topic = reference_of(rest.split("/")[0], canvas.references) if mark else None
+            topic = canvas.reference_of(rest.split("/")[0]) if mark else None
             reference = canvas.traces.get(canvas.base(topic)) if topic is not None else None
             found = compared(trace, reference, canvas.alignment) if reference is not None else None
             if found is None:

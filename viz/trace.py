@@ -134,23 +134,6 @@ def framed(traces: Sequence[Trace]) -> list[Trace]:
     return near or list(traces)
 
 
-def reference_of(run: str, references: Sequence[str]) -> str | None:
-    """Return the topic of a run's truth, as the evaluation does: that of its own sensor, else the common one.
-
-    Parameters
-    ----------
-    run : str
-        Id of the run, which ends with the parts of its input's topic (``foot_9iez_foot_imu2``).
-    references : sequence of str
-        Topics of positions (``/reference/pose``, ``/reference/imu2/pose``, ``/reference/footprints``).
-    """
-    sensors = {t: "_".join(t.split("/")[2:-1]) for t in references}
-    own = [t for t, sensor in sensors.items() if sensor and f"_{sensor}_" in f"_{run}_"]
-    if own:
-        return max(own, key=len)
-    return "/reference/pose" if "/reference/pose" in references else next(iter(references), None)
-
-
 def compared(trace: Trace, reference: Trace, alignment: str) -> Comparison | None:
     """Lay a trace upon a reference by :func:`marcha.replay.view.compare`, as the evaluation does.
 
