@@ -20,6 +20,7 @@ from ..recording.errors import MarchaError
 from ..recording.events import SIDECAR, TABLE
 from ..recording.selection import Selection, selected_topics, within
 from .rules import by_rules
+from .series import evenly
 
 EVENT = "foxglove_msgs/msg/Event"
 ESTIMATE = "/estimate/"
@@ -35,6 +36,12 @@ class McapOptions(Selection, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             description="keep annotations, and add stance phases and steps of runs that have none yet"
         ),
     ] = True
+    rate_hz: Annotated[
+        float,
+        msgspec.Meta(
+            ge=0, description="readings and estimates of numbers at even times of this rate (0: as recorded)"
+        ),
+    ] = 0.0
 
 
 class McapExporter:
@@ -48,8 +55,13 @@ class McapExporter:
     Options: ClassVar[type[msgspec.Struct]] = McapOptions
 
     def losses(self, rec: Recording, options: Any) -> list[str]:
-        """Return nothing but what the options leave out: this is the recording itself."""
-        return []
+        """Return what resampling takes away; else nothing, for this is the recording itself."""
+        if not options.rate_hz:
+            return []
+        topics = [t for t in selected_topics(rec, options) if rec.channels[t].schema != EVENT]
+        whole = [t for t in topics if not _continuous(rec, t)]
+        losses = [f"the times of the readings: they are interpolated to {options.rate_hz:g} Hz"]
+        return losses + ([f"(left as they are: {', '.join(whole)})"] if whole else [])
 
     def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:
         """Write one file; see :class:`marcha.export.Exporter`."""
@@ -57,7 +69,7 @@ class McapExporter:
         data = [t for t in topics if rec.channels[t].schema != EVENT]
         kept = [t for t in data if options.estimates or not t.startswith(ESTIMATE)]
         with create(path, overwrite=overwrite) as out:
-            if options.whole:
+            if options.whole and not options.rate_hz:
                 tiers = [t for t, c in rec.channels.items() if options.annotations and c.schema == EVENT]
                 out.copy_from(rec, [*kept, *tiers])
             else:
@@ -72,6 +84,25 @@ class McapExporter:
         return [path]
 
 
+CONTINUOUS = (
+    "sensor_msgs/msg/Imu",
+    "sensor_msgs/msg/MagneticField",
+    "sensor_msgs/msg/FluidPressure",
+    "sensor_msgs/msg/Temperature",
+    "sensor_msgs/msg/JointState",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/QuaternionStamped",
+    "geometry_msgs/msg/Vector3Stamped",
+    "marcha_msgs/msg/OpticalMarkers",
+    "marcha_msgs/msg/NavigationSigma",
+)
+"""Messages that state a quantity which has a value at every time; events, fixes and stances are not among them."""
+
+
+def _continuous(rec: Recording, topic: str) -> bool:
+    return rec.channels[topic].schema in CONTINUOUS
+
+
 def _copy_part(rec: Recording, topics: list[str], options: McapOptions, out: Writer) -> None:
     """Copy a range of time, with all that speaks of the whole."""
     for topic in topics:
@@ -81,7 +112,16 @@ def _copy_part(rec: Recording, topics: list[str], options: McapOptions, out: Wri
                 f"{rec.path}: {topic}: a part of a channel of type {about.schema} cannot be written; "
                 "leave out the range of time, or choose other topics"
             )
-        out.add_channel(topic, about.schema, about.frame_id, about.columns, about.metadata)
+        metadata = about.metadata
+        if options.rate_hz and _continuous(rec, topic):
+            metadata = {**metadata, "resampled_hz": f"{options.rate_hz:g}"}
+        out.add_channel(topic, about.schema, about.frame_id, about.columns, metadata)
+    if options.rate_hz:
+        for topic in [t for t in topics if _continuous(rec, t)]:
+            table = rec.table(topic, start_ns=options.start_ns, end_ns=options.end_ns)
+            if table.height:
+                out.add_table(topic, rec.channels[topic].schema, evenly(table, options.rate_hz))
+        topics = [t for t in topics if not _continuous(rec, t)]
     for window in rec.windows(topics, start_ns=options.start_ns, end_ns=options.end_ns):
         for topic, table in window.tables.items():
             out.add_table(topic, rec.channels[topic].schema, table)

@@ -190,7 +190,10 @@ class TrcExporter(OpensimExporter):
         return rec.channels[topic].schema == MARKERS
 
     def text(self, data: Together, options: OpensimOptions) -> str:
-        """Return the file; a marker that is not seen has empty cells."""
+        """Return the file; a marker that is not seen has empty cells.
+
+        Rows end with a tab: OpenSim's reader drops an empty cell at the end of a line.
+        """
         markers = [
             (
                 name.removesuffix(".x") if len(data.columns) == 1 else f"{topic}/{name.removesuffix('.x')}",
@@ -216,7 +219,9 @@ class TrcExporter(OpensimExporter):
             x, y, z = (data.columns[topic][f"{name}.{a}"] for a in "xyz")
             for a, values in zip("xyz", (x, z, -y) if options.y_up else (x, y, z), strict=True):
                 columns[f"{k}{a}"] = values
-        table = pl.DataFrame(columns).with_columns(pl.selectors.float().fill_nan(None))
+        table = pl.DataFrame(columns).with_columns(
+            pl.selectors.float().fill_nan(None), end=pl.lit(None, pl.String)
+        )
         return (
             head
             + titles

@@ -75,6 +75,32 @@ def together(rec: Recording, topics: list[str], selection: Selection) -> Togethe
     return Together(t_ns, out, resampled)
 
 
+def evenly(table: pl.DataFrame, rate_hz: float) -> pl.DataFrame:
+    """Return a table at even times from its first row on: numbers linearly, quaternions by slerp.
+
+    A gap of more than three usual intervals stays one: it has no rows. Frequencies above half the rate are not taken
+    out before: choose one that the signal allows.
+    """
+    rows = _sorted(table)
+    own = rows["t_ns"].to_numpy()
+    count = int((own[-1] - own[0]) * rate_hz / 1e9 + 1e-9) + 1
+    t_ns = own[0] + np.rint(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
+    t_ns = t_ns[t_ns <= own[-1]]
+    numbers = {n: rows[n].to_numpy().astype(float) for n in rows.columns if n != "t_ns"}
+    out = pl.DataFrame({"t_ns": t_ns, **_resampled(own, numbers, t_ns)}).select(rows.columns)
+    inside_gap = _far(own, t_ns)
+    return out.filter(pl.Series(~inside_gap)) if inside_gap.any() else out
+
+
+def _far(own: Times, t_ns: Times) -> NDArray[np.bool_]:
+    """Return which times lie in a gap of more than three usual intervals."""
+    if len(own) < 2:
+        return np.zeros(len(t_ns), bool)
+    k = np.clip(np.searchsorted(own, t_ns, side="left"), 1, len(own) - 1)
+    usual = float(np.median(np.diff(own)))
+    return (own[k] - own[k - 1] > 3 * usual) & (t_ns != own[k]) & (t_ns != own[k - 1])
+
+
 def _sorted(table: pl.DataFrame) -> pl.DataFrame:
     return table.unique("t_ns", keep="first", maintain_order=True).sort("t_ns")
 
@@ -85,12 +111,9 @@ def _resampled(own: Times, numbers: dict[str, Floats], t_ns: Times) -> dict[str,
     out = {n: np.interp(at, x, v) for n, v in numbers.items() if n not in QUATERNION}
     if all(n in numbers for n in QUATERNION):
         out |= _slerp(x, np.column_stack([numbers[n] for n in QUATERNION]), at)
-    usual = float(np.median(np.diff(x))) if len(x) > 1 else np.inf
-    k = np.clip(np.searchsorted(x, at, side="left"), 1, max(len(x) - 1, 1))
-    if len(x) > 1:
-        far = (x[k] - x[k - 1] > 3 * usual) & (at != x[k]) & (at != x[k - 1])
-        for values in out.values():
-            values[far] = np.nan
+    far = _far(own, t_ns)
+    for values in out.values():
+        values[far] = np.nan
     return out
 
 

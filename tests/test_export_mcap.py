@@ -6,9 +6,11 @@ import json
 from pathlib import Path
 
 import marcha.recording as mr
+import numpy as np
 import polars as pl
 import pytest
 from marcha.export import export
+from marcha.export.series import evenly
 from marcha.recording import Recording
 from polars.testing import assert_frame_equal
 
@@ -106,3 +108,31 @@ def test_a_part_of_the_time(rec: Recording) -> None:
 def test_topics_can_be_chosen(rec: Recording) -> None:
     out = exported(rec, topics="/foot/*")
     assert [t for t in out.channels if not t.startswith("/annotation")] == ["/foot/imu1", "/foot/mag"]
+
+
+def test_readings_at_even_times(rec: Recording) -> None:
+    out = exported(rec, rate_hz="40")
+    imu, own = out.table("/foot/imu1"), rec.table("/foot/imu1")
+    t = imu["t_ns"].to_numpy()
+    assert np.array_equal(np.diff(t), np.full(len(t) - 1, 25_000_000))
+    assert t[0] == own["t_ns"][0]
+    assert own["t_ns"][-1] - t[-1] < 25_000_000
+    expected = np.interp(t - t[0], own["t_ns"].to_numpy() - t[0], own["acc_y"].to_numpy())
+    assert np.allclose(imu["acc_y"].to_numpy(), expected, atol=1e-12)
+    norm = np.linalg.norm(
+        out.table("/reference/pose").select([f"quat_{a}" for a in "wxyz"]).to_numpy(), axis=1
+    )
+    assert np.abs(norm - 1).max() < 1e-12
+    assert out.channels["/foot/imu1"].metadata["resampled_hz"] == "40"
+    for topic in ("/phone/gnss", "/estimate/mine/stance"):  # no quantity between two of these
+        assert_frame_equal(out.table(topic, log_time=True), rec.table(topic, log_time=True))
+    assert out.metadata["device"] == rec.metadata["device"]
+    assert out.annotations["label"].to_list().count("turn") == 1
+
+
+def test_a_gap_stays_a_gap() -> None:
+    t = np.r_[np.arange(0, 10**9, 10**7), np.arange(3 * 10**9, 4 * 10**9, 10**7)]
+    table = evenly(pl.DataFrame({"t_ns": t, "x": t * 1e-9}), 50.0)
+    got = table["t_ns"].to_numpy()
+    assert not ((got > 990_000_000) & (got < 3 * 10**9)).any()
+    assert np.allclose(table["x"].to_numpy(), got * 1e-9)

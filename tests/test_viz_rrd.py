@@ -17,6 +17,7 @@ import polars as pl
 import pytest
 import rerun as rr
 from marcha.recording.errors import MarchaError, OutputExists, UsageError
+from marcha.recording.provenance import hash_file
 from marcha.recording.selection import Selection
 from marcha.viz.timeaxis import SINCE_START, UTC
 from marcha.viz.views.tracks import Sigma
@@ -323,6 +324,36 @@ def test_the_report_names_runs_metrics_and_parameters(folder: Path) -> None:
     (text,) = statics(folder / "done.rrd", "/report", "TextDocument:text")
     for word in ("# done.mcap", RUN, "closure_m", "sigma_acc", "/foot/imu1"):
         assert word in text
+
+
+def test_metrics_and_truth_are_properties_of_the_recording(done: mr.Recording, tmp_path: Path) -> None:
+    with mr.create(tmp_path / "known.mcap") as out:
+        out.copy_from(done)
+        out.add_metadata("truth", {"closed": "true", "steps": "16"})
+    viz.write_rrd(mr.open(tmp_path / "known.mcap"), tmp_path / "known.rrd")
+    found: dict[str, object] = {}
+    for chunk in RrdReader(tmp_path / "known.rrd").stream().filter(content="/__properties/**"):
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            what = str(chunk.entity_path).replace("\\ ", " ").removeprefix("/__properties/")
+            found[f"{what}: {name.rpartition(':')[2]}"] = batch.column(name)[0].as_py()
+    metrics = rp.evaluate(done).runs[0].metrics
+    assert found[f"metrics {RUN}: ate_rmse_m"] == [pytest.approx(metrics["ate_rmse_m"])]
+    assert found["truth: closed"] == ["true"]
+    assert found["truth: steps"] == [16.0]
+
+
+def test_the_same_file_gives_the_same_recording_and_a_part_another(
+    done: mr.Recording, tmp_path: Path
+) -> None:
+    def identity(name: str, **options: object) -> str:
+        viz.write_rrd(done, tmp_path / name, selection=Selection(**options) if options else None)  # type: ignore[arg-type]
+        (entry,) = RrdReader(tmp_path / name).recordings()
+        return entry.recording_id
+
+    first, again = identity("a.rrd"), identity("b.rrd")
+    assert first == again == hash_file(done.path)
+    assert identity("c.rrd", topics=("/foot/imu1",)) not in (first, "")
 
 
 def test_the_time_line_is_since_the_start(folder: Path) -> None:

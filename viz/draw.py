@@ -8,9 +8,11 @@ import rerun as rr
 
 from ..recording import Recording
 from ..recording.selection import Selection, selected_topics, within
+from ..replay import Evaluation
 from .blueprint import blueprint, extent
+from .canvas import entity
 from .floor import loaders_of
-from .report import report
+from .report import measured, report
 from .scene import Scene
 from .stream import send_blueprint
 from .text import printable
@@ -66,7 +68,9 @@ def draw(
         if annotating:
             scene.lanes.show()
         scene.end()
-        text = rr.TextDocument(report(rec), media_type=rr.MediaType.MARKDOWN)
+        metrics = measured(rec)
+        send_facts(stream, rec, metrics, prefix)
+        text = rr.TextDocument(report(rec, metrics), media_type=rr.MediaType.MARKDOWN)
         scene.canvas.static(f"{scene.canvas.prefix}/report", text)
         scenes.append(scene)
     canvases = [scene.canvas for scene in scenes]
@@ -75,10 +79,47 @@ def draw(
     return scenes
 
 
+OF_THE_WALK = ("truth", "subject")
+"""Metadata records that become properties of the viewer's recording."""
+
+
+def send_facts(
+    stream: rr.RecordingStream, rec: Recording, metrics: Evaluation | str, prefix: str = ""
+) -> None:
+    """Send metrics, subject and truth as properties, so that recordings can be sorted and chosen by them.
+
+    Parameters
+    ----------
+    stream : rerun.RecordingStream
+        Where to.
+    rec : Recording
+        The recording.
+    metrics : Evaluation or str
+        Of its runs; a text says why there are none.
+    prefix : str
+        Entity path of the recording among several.
+    """
+    begin = f"{prefix[1:]} " if prefix else ""
+    for name in OF_THE_WALK:
+        facts = {printable(k): _fact(v) for k, v in rec.metadata.get(name, {}).items()}
+        if facts:
+            stream.send_property(f"{begin}{name}", rr.AnyValues(**facts))
+    for run in metrics.runs if not isinstance(metrics, str) else ():
+        values = dict(run.metrics)
+        if values:
+            stream.send_property(f"{begin}metrics {run.run}", rr.AnyValues(**values))
+
+
+def _fact(text: str) -> float | str:
+    """Return a number as one: Rerun wants one type a name, and metrics of the same name are numbers."""
+    try:
+        return float(text)
+    except ValueError:
+        return printable(text)
+
+
 def prefixes_of(recs: Sequence[Recording]) -> list[str]:
     """Return one entity prefix a recording: its file's name, numbered where two are alike."""
-    from .canvas import entity
-
     names = [rec.path.stem for rec in recs]
     return [
         entity(f"/{n}" if names.count(n) == 1 else f"/{n}-{names[: i + 1].count(n)}")

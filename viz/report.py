@@ -9,7 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from ..recording import Recording
 from ..recording import open as open_recording
 from ..recording.errors import MarchaError
-from ..replay import ReplayResult, evaluate
+from ..replay import Evaluation, ReplayResult, RunEvaluation, evaluate
+from .canvas import is_estimate
 from .text import printable
 
 LONGEST = 120
@@ -18,18 +19,34 @@ LONGEST = 120
 LINEAGE = ("estimator", "version", "input", "samples", "loop_s")
 
 
-def report(rec: Recording) -> str:
+def measured(rec: Recording) -> Evaluation | str:
+    """Return the metrics of a recording's runs, or why there are none."""
+    if not any(n.startswith("run/") for n in rec.metadata) and not any(map(is_estimate, rec.channels)):
+        return ""
+    try:
+        return evaluate(rec)
+    except MarchaError as error:
+        return printable(error)
+
+
+def report(rec: Recording, metrics: Evaluation | str | None = None) -> str:
     """Return what a recording and its runs are, as Markdown.
 
     Parameters
     ----------
     rec : Recording
         Raw, or with estimates (their metrics are measured, see :func:`marcha.replay.evaluate`).
+    metrics : Evaluation or str, optional
+        What :func:`measured` returned; it is asked without it.
     """
+    if metrics is None:
+        metrics = measured(rec)
     runs = {n.removeprefix("run/"): m for n, m in rec.metadata.items() if n.startswith("run/")}
     parts = [f"# {printable(rec.path.name)}", "", f"{rec.duration_s:.2f} s, {len(rec.channels)} channels", ""]
-    if runs or any(t.startswith("/estimate/") for t in rec.channels):
-        parts += _metrics(rec)
+    if isinstance(metrics, str):
+        parts += ["## Metrics", "", f"Not measured: {metrics}", ""] if metrics else []
+    else:
+        parts += _metrics(metrics.runs)
     if runs:
         parts += _parameters(runs)
         parts += _findings(
@@ -69,11 +86,7 @@ def replay_report(result: ReplayResult) -> str:
     )
 
 
-def _metrics(rec: Recording) -> list[str]:
-    try:
-        runs = evaluate(rec).runs
-    except MarchaError as error:
-        return ["## Metrics", "", f"Not measured: {printable(error)}", ""]
+def _metrics(runs: Sequence[RunEvaluation]) -> list[str]:
     names = list(dict.fromkeys(m for r in runs for m in r.metrics))
     rows = [[m, *(_number(r.metrics.get(m)) for r in runs)] for m in names]
     parts = ["## Metrics", "", *_table(["metric", *(r.run for r in runs)], rows)]

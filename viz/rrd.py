@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from hashlib import blake2b
 from pathlib import Path
 from typing import ClassVar
 
@@ -10,6 +11,7 @@ import msgspec
 
 from ..recording import Recording
 from ..recording.atomic import AtomicFile
+from ..recording.provenance import hash_file
 from ..recording.selection import Selection
 
 
@@ -55,7 +57,7 @@ def write_rrd(
         from .draw import draw
         from .stream import finish, new_stream, release
 
-        stream = new_stream()
+        stream = new_stream(_identity(recs, selection))
         stream.set_sinks(rr.FileSink(file.part))
         draw(recs, stream, selection)
         finish(stream, file)
@@ -66,6 +68,15 @@ def write_rrd(
         raise
     file.commit()
     return Path(path)
+
+
+def _identity(recs: Sequence[Recording], selection: Selection | None) -> str:
+    """Return an id that is the same whenever the same of the same files is written: a hash of their content."""
+    parts = [hash_file(rec.path) for rec in recs]
+    chosen = "" if selection is None else msgspec.json.encode(selection).decode()
+    if len(parts) == 1 and (selection is None or (selection.whole and not selection.topics)):
+        return parts[0]
+    return blake2b("\n".join([*parts, chosen]).encode(), digest_size=16).hexdigest()
 
 
 class RrdExporter:

@@ -11,9 +11,15 @@ from ..recording.errors import MarchaError
 APPLICATION = "marcha"
 
 
-def new_stream() -> rr.RecordingStream:
-    """Return a stream with the time lines of the recordings and nothing of Rerun's own."""
-    stream = rr.RecordingStream(APPLICATION)
+def new_stream(recording_id: str | None = None) -> rr.RecordingStream:
+    """Return a stream with the time lines of the recordings and nothing of Rerun's own.
+
+    Parameters
+    ----------
+    recording_id : str, optional
+        Streams of one id are one recording in a viewer or a catalogue; each is its own without it.
+    """
+    stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     return stream
