@@ -24,6 +24,10 @@ NO_ANNOTATIONS = pl.DataFrame(
 )
 
 
+TEXT_ROWS = 16384
+"""Rows whose texts are made together: a day has a hundred thousand steps, and texts take much memory."""
+
+
 @dataclass
 class _Stretch:
     """The stretch of a state that is open."""
@@ -102,7 +106,8 @@ class Marker:
         rows = pl.DataFrame({name: np.concatenate([r[name] for r in self._rows]) for name in self._rows[0]})
         if self.how.kind == "instant":
             rows = rows.with_columns(pl.col("t_ns").alias("start_ns"), pl.col("t_ns").alias("end_ns"))
-        return _row_annotations(rows, self.tier, self.how.label or self.how.tier)
+        label = self.how.label or self.how.tier
+        return pl.concat([_row_annotations(r, self.tier, label) for r in rows.iter_slices(TEXT_ROWS)])
 
 
 def _row_annotations(rows: pl.DataFrame, tier: str, label: str) -> pl.DataFrame:

@@ -70,7 +70,7 @@ def distance(view: RunView) -> dict[str, float]:
 
 def _length(t_ns: IntArray, position: FloatArray, spans: IntArray | None) -> float:
     """Return the horizontal length of a polygon; in stretches of time, of the sides whose middle is in them."""
-    block = 1_000_000  # the differences of a long walk need not lie in memory together
+    block = 1 << 17  # the differences of a long walk need not lie in memory together
     total = 0.0
     for i in range(0, max(1, len(position) - 1), block):
         side = np.hypot(*np.diff(position[i : i + block + 1, :2], axis=0).T)

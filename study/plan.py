@@ -181,6 +181,12 @@ def _files(
             raise UsageError(f"{root}: no such file or folder; give the folder of the recordings with --data")
         base = root if root.is_dir() else root.parent
         found = sorted({p for g in recordings.files for p in root.glob(g)}) if root.is_dir() else [root]
+        if root.is_dir() and (left := _left_out(root, found)):
+            some = ", ".join(str(p.relative_to(root)) for p in left[:3])
+            notes.append(
+                f"{len(left)} of {len(left) + len(found)} files in {root} do not match `files` "
+                f"({', '.join(recordings.files)}) and are left out: {some}{' …' if len(left) > 3 else ''}"
+            )
         # The truth of a simulated walk stands beside its log and belongs to it.
         for path in (p for p in found if p.is_file() and ".truth." not in p.name):
             name = str(path.relative_to(base).with_suffix("").as_posix())
@@ -201,6 +207,20 @@ def _files(
         where = ", ".join(str(r) for r in roots)
         raise UsageError(f"{where}: no file matches {', '.join(recordings.files)}; check --data and `files`")
     return sorted(names.items()), notes
+
+
+def _left_out(root: Path, found: Sequence[Path]) -> list[Path]:
+    """Return the files of a folder, and of those in it, that no pattern takes: hidden ones and truth apart."""
+    taken = set(found)
+    return [
+        p
+        for p in sorted(root.rglob("*"))
+        if p.is_file()
+        and p not in taken
+        and ".truth." not in p.name
+        and p.suffix != ".toml"
+        and not any(part.startswith(".") for part in p.relative_to(root).parts)
+    ]
 
 
 def _source(recordings: cfg.Recordings, name: str, path: Path, code: str) -> StudyRecording:

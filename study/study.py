@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -346,31 +347,46 @@ def _provenance(code: str, started: datetime, executor: str) -> dict[str, str]:
     }
 
 
+def write_csv(table: pl.DataFrame, path: Path) -> None:
+    """Write a table for spreadsheets: a text that one would take for a formula gets an apostrophe before it.
+
+    The Parquet table has every text as it is.
+    """
+    formula = {
+        c: pl.col(c).str.contains(r"^[=+\-@\t\r]") & pl.col(c).cast(pl.Float64, strict=False).is_null()
+        for c, kind in table.schema.items()
+        if kind == pl.String
+    }
+    table.with_columns(
+        pl.when(f).then(pl.format("'{}", pl.col(c))).otherwise(pl.col(c)).alias(c) for c, f in formula.items()
+    ).write_csv(path)
+
+
 def _write(folder: Path, contents: ReportContents, pictures: list[PagePicture]) -> list[Path]:
     """Write tables, figures and report; return the files. Older figures are removed."""
     page = render(contents, pictures)
     provenance = msgspec.json.format(msgspec.json.encode(contents.provenance))
     writers: dict[str, Callable[[Path], object]] = {
         "results.parquet": contents.results.write_parquet,
-        "results.csv": contents.results.write_csv,
-        "groups.csv": contents.groups.write_csv,
-        "comparisons.csv": contents.comparisons.write_csv,
-        "paired.csv": contents.paired.write_csv,
-        **({"failures.csv": contents.failures.write_csv} if len(contents.failures) else {}),
-        "outliers.csv": contents.outliers.write_csv,
+        "results.csv": partial(write_csv, contents.results),
+        "groups.csv": partial(write_csv, contents.groups),
+        "comparisons.csv": partial(write_csv, contents.comparisons),
+        "paired.csv": partial(write_csv, contents.paired),
+        **({"failures.csv": partial(write_csv, contents.failures)} if len(contents.failures) else {}),
+        "outliers.csv": partial(write_csv, contents.outliers),
         **(
             {
-                "pairs.csv": contents.pairs.write_csv,
-                "verdicts.csv": contents.verdicts.write_csv,
-                "relations.csv": contents.relations.write_csv,
+                "pairs.csv": partial(write_csv, contents.pairs),
+                "verdicts.csv": partial(write_csv, contents.verdicts),
+                "relations.csv": partial(write_csv, contents.relations),
             }
             if contents.config.published or contents.config.verdicts
             else {}
         ),
         **(
             {
-                "labels.csv": contents.labels.write_csv,
-                "label_comparisons.csv": contents.label_comparisons.write_csv,
+                "labels.csv": partial(write_csv, contents.labels),
+                "label_comparisons.csv": partial(write_csv, contents.label_comparisons),
             }
             if contents.config.by
             else {}

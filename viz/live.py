@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -80,12 +82,19 @@ def show(
         del stream
         release()
         if wait if wait is not None else web:
+            _take_back_interrupts()
             with window:
                 window.wait()
     except BaseException:
         window.close()
         raise
     return window
+
+
+def _take_back_interrupts() -> None:
+    """Have Ctrl-C end the wait: Rerun's library takes the signal once it has sent data."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.getsignal(signal.SIGINT))
 
 
 _BEAT_NS = 100_000_000

@@ -81,7 +81,8 @@ class SensorTester:
 
 
 def _is_header(cells: Sequence[str]) -> bool:
-    return cells[0] == TIME and any(c.startswith("AccX[") for c in cells)
+    names = {c.split("[")[0] for c in cells}
+    return cells[0] == TIME and {"AccX", "AccY", "AccZ"} <= names
 
 
 def _parts(named: dict[str, str]) -> tuple[list[StreamChannel], set[str]]:
