@@ -112,7 +112,9 @@ def declared_columns(schema: Schema, text: str) -> tuple[str, ...] | None:
     if schema.names:
         fits = all(any(n.endswith(c.name) for c in schema.columns) for n in names)
     else:
-        fits = set(schema.needed) <= set(names) <= {c.name for c in schema.columns}
+        groups = [{c.name for c in g.columns} for g in schema.groups]
+        whole = all(g <= set(names) or not g & set(names) for g in groups)
+        fits = whole and set(schema.needed) <= set(names) <= set().union(*groups)
     return names if fits and len(set(names)) == len(names) and "t_ns" not in names else None
 
 
