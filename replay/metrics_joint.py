@@ -303,13 +303,35 @@ def doubts(view: RunView) -> list[str]:
             )
             if there:
                 found.append(f"{name}: the reference has {there}; convert it with --set side=left (or right)")
-    for name, at, estimate, reference in angles_beside(view):
+    beside = angles_beside(view)
+    found += _coverage(ours, truth, sum(at.size for _, at, _, _ in beside))
+    for name, at, estimate, reference in beside:
         if at.size > 100 and pearson_r(estimate, reference) < -0.5:
             found.append(
                 f"{name}: turns against its reference (r {pearson_r(estimate, reference):.2f}): reverse the flexion "
                 "axis (-p axis=-x), or check which sensor is on which segment"
             )
     return found
+
+
+def _coverage(ours: pl.DataFrame, truth: pl.DataFrame, compared: int) -> list[str]:
+    """Say where estimate and reference have no time in common, or the reference covers a part only."""
+    if ours.is_empty() or truth.is_empty():
+        return []
+    first, last, start, end = (
+        float(f(t["t_ns"].to_numpy())) * 1e-9 for t in (ours, truth) for f in (np.min, np.max)
+    )
+    if start > last or end < first:
+        return [
+            f"no overlap: the estimate covers {first:.1f} to {last:.1f} s, the reference {start:.1f} to {end:.1f} s; "
+            "bring them on one clock with marcha align"
+        ]
+    common = min(last, end) - max(first, start)
+    if compared and common < 0.9 * (last - first):
+        return [
+            f"the reference covers {common:.1f} s of the estimate's {last - first:.1f} s: only these are judged"
+        ]
+    return []
 
 
 Series = tuple[IntArray, FloatArray]

@@ -95,3 +95,21 @@ def test_the_table_has_every_tenth_of_the_cycle(tmp_path: Path) -> None:
     assert "knee over 14 gait cycles (from signal)" in out
     rows = [line.split() for line in out.splitlines() if line[:3].strip().isdigit()]
     assert [int(r[0]) for r in rows] == list(range(0, 101, 10))
+
+
+@pytest.mark.parametrize(
+    ("later", "message"),
+    [
+        (60, "no overlap: the estimate covers 0.0 to 20.0 s, the reference 60.0"),
+        (12, "the reference covers 8.0 s"),
+    ],
+)
+def test_a_reference_of_another_time_or_a_part_is_said(tmp_path: Path, later: int, message: str) -> None:
+    path = tmp_path / "c.mcap"
+    with mr.create(path) as out:
+        moved = pl.DataFrame({"t_ns": T + later * 1_000_000_000, "knee": ANGLE})
+        out.add_table("/reference/joint", JOINT, moved)
+        out.add_table("/estimate/one/joint", JOINT, pl.DataFrame({"t_ns": T, "knee": ANGLE}))
+    done = marcha("evaluate", path)
+    assert done.code == 0
+    assert [line for line in done.out.splitlines() if message in line]
