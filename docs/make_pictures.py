@@ -88,6 +88,56 @@ def page(folder: Path, image: Path) -> None:
     print(image)
 
 
+def marked(walk: mr.Recording, folder: Path) -> mr.Recording:
+    """Mark three bad stretches in a walk."""
+    zero = walk.start_ns or 0
+    stretches = pl.DataFrame(
+        {
+            "tier": "manual",
+            "start_ns": [zero + round(t * 1e9) for t in (5.1, 11.4, 18.3)],
+            "end_ns": [zero + round(t * 1e9) for t in (6.3, 13.2, 19.0)],
+            "label": "bad stretch",
+            "source": "human:eva",
+        }
+    )
+    change(walk, folder / "walk.mcap", add=stretches, action="page", by="eva")
+    return mr.open(folder / "walk.mcap")
+
+
+def annotating(walk: mr.Recording, folder: Path, images: Path) -> None:
+    """Take the pictures of the annotating page and of the viewer while marking."""
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    import rerun as rr
+    from marcha.viz.annotating.server import PageServer
+    from marcha.viz.draw import draw
+    from marcha.viz.stream import finish, new_stream
+    from PIL import Image
+
+    from tests.page_helpers import chromium, opened, until
+
+    stream = new_stream()
+    stream.set_sinks(rr.FileSink(folder / "annotate.rrd"))
+    draw([walk], stream, annotating=True)
+    finish(stream)
+    for picture in screenshots(folder / "annotate.rrd", ["Overview"], at=0.62):
+        save(picture, images / "viewer-annotate.png")
+    session = viz.annotating.Session(walk, walk.path, by="eva", overwrite=True, action="page")
+    with chromium() as browser, PageServer(session) as server:
+        page = opened(browser, server.address, (1400, 800))
+        page.locator("#label").fill("bad stretch")
+        page.keyboard.press("Escape")
+        page.evaluate(
+            "() => { const mine = marcha.marks.sorted().filter((r) => r.tier === 'manual');"
+            " marcha.view.start = 4e9; marcha.view.end = 21e9;"
+            " marcha.select(mine[1].id); marcha.setCursor(mine[1].end_ns); }"
+        )
+        until(page, "!marcha.stage.dirty && marcha.listing")
+        until(page, "!marcha.listing")
+        image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+        image.quantize(64, dither=Image.Dither.NONE).save(images / "page.png", optimize=True)
+        print(images / "page.png")
+
+
 def main() -> None:
     """Make all pictures."""
     images = Path(sys.argv[1]) if len(sys.argv) > 1 else IMAGES
@@ -105,6 +155,7 @@ def main() -> None:
         for picture in screenshots(rrd, ["Detector"], at=0.62):
             save(picture, images / "viewer-detector.png")
         print(viz.save_figure(walk, images / "figure.png", overwrite=True))
+        annotating(marked(replayed(folder, "rectangle", FILTERS[:1], "marked"), folder), folder, images)
         others = [replayed(folder, name, FILTERS[:2], name) for name in ("figure-eight", "stairs")]
         print(viz.save_figure(others, images / "figure-several.png", overwrite=True))
 

@@ -127,9 +127,11 @@ class Runner:
         return blocks
 
     def annotations(self) -> pl.DataFrame:
-        """Return what the outputs declare as annotations, by start."""
+        """Return what the outputs declare as annotations, by start, with the estimator as their source."""
         tables = [NO_ANNOTATIONS, *(m.table() for m in self.markers.values())]
-        return pl.concat(tables).sort("start_ns", maintain_order=True)
+        version = self.plan.version.rpartition(" ")[2]  # behind the distribution's name
+        source = pl.lit(f"algorithm:{self.plan.name}@{version}").alias("source")
+        return pl.concat(tables).sort("start_ns", maintain_order=True).with_columns(source)
 
     def _close_marks(self) -> None:
         for marker in self.markers.values():

@@ -148,6 +148,8 @@ def test_stances_and_steps_become_annotations(done: tuple[Any, Recording]) -> No
     for start, end in stances.select("start_ns", "end_ns").iter_rows():
         inside |= (still >= start) & (still <= end)
     assert inside.all()
+    (source,) = stances["source"].unique()
+    assert source.startswith("algorithm:foot.9iez@")
     steps = marks.filter(pl.col("tier") == f"{run.run}/step")
     assert steps.height == run.tables["step"].height == run.metrics["steps"]
     assert steps["end_ns"].to_list() == run.tables["step"]["end_ns"].to_list()

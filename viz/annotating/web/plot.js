@@ -2,6 +2,7 @@
 // picture; sparse ones as lines from row to row.
 
 const GAP = 3; // no line over more than so many usual intervals
+const SPARSE = 3; // rows a pixel up to which lines are drawn: they are smooth, ranges of values are quick
 
 export class Plot {
   constructor(canvas) {
@@ -25,7 +26,7 @@ export class Plot {
       const series = pieces.length ? box.panel.columns.map((c) => this.ranges(box, pieces, view, c)) : [];
       box.range = range(box, series, fit);
       if (!box.range) continue;
-      const sparse = pieces.length && pieces.every((p) => p.rows === 1) && rowsSeen(pieces) < box.width;
+      const sparse = pieces.length && pieces.every((p) => p.rows === 1) && rowsSeen(pieces) < SPARSE * box.width;
       for (let k = series.length - 1; k >= 0; k--) {
         if (sparse) lines.push([box, pieces, box.panel.columns[k]]);
         else this.fill(box, series[k], box.panel.columns[k].color);
