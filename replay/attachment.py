@@ -7,7 +7,8 @@ The rule, in this order, for every input:
    like the input where several fit. An input with a ``stage`` is served by that estimator where the chain names
    none.
 3. Else a raw channel whose message type and columns fit (topics named with ``--input`` alone limit the choice).
-   Where topics have the input's name as a part (``/leg/thigh/imu`` for ``thigh``), only those count.
+   Where topics have the input's name as a part (``/leg/thigh/imu`` for ``thigh``), only those count. Where they have
+   it with a side (``/leg/left_thigh/imu``, ``/leg/right_thigh/imu``), every side makes a run of its own.
    The first required input decides about the device: without a name every fitting channel makes a run of its
    own. A further input takes the only fitting channel that is nearest to it: of the same device (``/phone/mag``
    beside ``/phone/imu``), else of the same body (``/leg/encoder`` beside ``/leg/thigh/imu``). Two inputs that
@@ -27,6 +28,7 @@ from ..algorithms.contract import ALL_COLUMNS, Input
 from ..recording.errors import Finding, UsageError
 from .sources import PlannedChannel, Source
 
+SIDES = ("left", "right")
 NOT_RAW = ("/reference/", "/estimate/", "/annotation/")
 """Topics that an estimator never takes on its own."""
 
@@ -165,8 +167,11 @@ def attach(
         if not candidates:
             raise UsageError(_nothing_fits(first, name, source, chosen))
         alike = [i for i in inputs if _same_request(i, first) and i.name not in fixed and not i.optional]
+        sides = _sides(alike, source, chosen)
         if first.many:
             groups = [{first.name: tuple(candidates)}]
+        elif sides:
+            groups = [{i.name: (own[i.name],) for i in alike} for own in sides]
         elif len(alike) > 1:
             groups = [_together(alike, candidates, name, source, chosen, notes)]
         else:
@@ -249,6 +254,23 @@ def _nothing_fits(need: Input, name: str, source: Source, chosen: NamedChannels)
     )
 
 
+def _sides(alike: Sequence[Input], source: Source, chosen: NamedChannels) -> list[dict[str, PlannedChannel]]:
+    """Return, for every side on which all of the inputs have a channel of their name, these channels."""
+    found = []
+    for side in SIDES:
+        pool = _candidates(Input("", alike[0].schema, alike[0].columns), source, chosen, only_named=True)
+        own = {i.name: [c for c in pool if f"{side}_{i.name}" in c.topic.split("/")] for i in alike}
+        if all(len(channels) == 1 for channels in own.values()):
+            found.append({name: channels[0] for name, channels in own.items()})
+    return found
+
+
+def _side_of(topics: Iterable[str]) -> str:
+    """Return the side that topics speak of (``/leg/left_thigh/imu``); empty without one."""
+    parts = [part for topic in topics for part in topic.split("/")]
+    return next((side for side in SIDES if any(part.startswith(f"{side}_") for part in parts)), "")
+
+
 def _together(
     alike: Sequence[Input],
     candidates: Sequence[PlannedChannel],
@@ -306,6 +328,7 @@ def _complete(
     channels: dict[str, tuple[PlannedChannel, ...]] = {}
     raw = [c for attached in have.values() for c in attached if not c.run]
     beside = device_of(raw[0].topic) if raw else device
+    side = _side_of(c.topic for c in raw)
     for need in inputs:
         if need.name in have:
             channels[need.name] = have[need.name]
@@ -313,6 +336,15 @@ def _complete(
         candidates = _candidates(need, source, chosen, beside)
         own = {c.topic for i in inputs if _same_request(i, need) for c in have.get(i.name, ())}
         candidates = [c for c in candidates if c.topic not in own]
+        if side and not need.many:
+            mine = [
+                c
+                for c in _candidates(need, source, chosen)
+                if f"{side}_{need.name}" in c.topic.split("/") and c.topic not in own
+            ]
+            both = [c for c in candidates if not _side_of([c.topic])]
+            named = [c for c in both if need.name in c.topic.split("/")]
+            candidates = mine or named or (both if not _same_request(need, inputs[0]) else [])
         if need.many or len(candidates) == 1:
             channels[need.name] = tuple(candidates)
         elif not candidates:

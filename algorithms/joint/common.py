@@ -169,8 +169,16 @@ class JointEstimator(KernelEstimator):
         self._lay(context)
 
     def joint_names(self) -> tuple[str, ...]:
-        """Return the names of the joints between the attached segments."""
-        return tuple(joint_name(a, b) for a, b in zip(self.segments, self.segments[1:], strict=False))
+        """Return the names of the joints between the attached segments, with the side that their topics name."""
+        pairs = zip(self.segments, self.segments[1:], strict=False)
+        return tuple(self.side + joint_name(a, b) for a, b in pairs)
+
+    @property
+    def side(self) -> str:
+        """``left_`` or ``right_`` where the channels are of one leg (``/leg/left_thigh/imu``), else empty."""
+        topics = [c.topic for name in self.segments for c in self.context.channels.get(name, ())]
+        parts = [part for topic in topics for part in topic.split("/")]
+        return next((s for s in ("left_", "right_") if any(part.startswith(s) for part in parts)), "")
 
     def _lay(self, context: Context) -> None:
         s, p = self.state[0], self.params

@@ -262,10 +262,11 @@ class JointRelative(ChainEstimator):
 
 
 def for_joint(text: str, joint: str) -> str:
-    """Return the part of ``text`` that is about ``joint``: ``hip=free knee=hinge`` or one for all."""
+    """Return the part of ``text`` about ``joint``: ``hip=free knee=hinge`` (of both legs), or one for all."""
     if "=" not in text:
         return text.strip()
-    return dict(part.split("=", 1) for part in text.split() if "=" in part).get(joint, "")
+    given = dict(part.split("=", 1) for part in text.split() if "=" in part)
+    return given.get(joint, given.get(joint.removeprefix("left_").removeprefix("right_"), ""))
 
 
 def numbers(text: str, count: int, name: str) -> FloatArray:
