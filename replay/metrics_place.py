@@ -76,7 +76,7 @@ def places(view: RunView) -> dict[str, float]:
     if ours is None:
         return waypoint_ellipse(view)
     plane = Plane(ours["lat_deg"][0], ours["lon_deg"][0])
-    track = Places(ours["t_ns"].to_numpy(), plane(ours), _stated(ours, view.table("state")))
+    track = Places(ours["t_ns"].to_numpy(), plane(ours), stated_covariances(ours, view.table("state")))
     raw = _raw_fixes(view)
     found: dict[str, float] = {}
     reference = usable(view.reference_table("fix")) if view.recording is not None else None
@@ -118,7 +118,7 @@ def _raw_fixes(view: RunView) -> pl.DataFrame | None:
     return table
 
 
-def _stated(
+def stated_covariances(
     table: pl.DataFrame, state: pl.DataFrame | None, sd: tuple[str, str] = ("sd_east_m", "sd_north_m")
 ) -> FloatArray:
     """Return the covariances that a run states, shape (n, 2, 2)."""
@@ -195,7 +195,7 @@ def waypoint_ellipse(view: RunView) -> dict[str, float]:
     sigma = view.table("sigma")
     if sigma is None or not {"sigma_pos_x", "sigma_pos_y"} <= set(sigma.columns):
         return {}
-    cov = _stated(sigma, view.table("state"), ("sigma_pos_x", "sigma_pos_y"))
+    cov = stated_covariances(sigma, view.table("state"), ("sigma_pos_x", "sigma_pos_y"))
     at = np.searchsorted(sigma["t_ns"].to_numpy(), compared.t_ns, "right") - 1
     later = at[1:] >= 0  # the first one has no error by definition
     begin = cov[at[0]] if at[0] >= 0 else np.zeros((2, 2))

@@ -42,6 +42,10 @@ FIELDS: list[tuple[Any, ...]] = [
 SMOOTH_S = 0.06
 FADE = 0.15
 """Weight of a step in the running power: a memory of six to seven steps."""
+SETTLED = 12
+"""Steps after which fore and aft change places only on clear evidence: people do not often walk backwards."""
+ABOUT_FACE = 0.8
+"""Least cosine between the evidence of fore and the axis that is clear."""
 SCREEN_UP = 0.5
 """Least up component of the z axis of a phone that is held before the body (tilt up to 60°)."""
 
@@ -178,7 +182,12 @@ def _shaken(s: Any, first: int, last: int) -> None:
     s.fore[0] += k * (fx / n - s.fore[0])
     s.fore[1] += k * (fy / n - s.fore[1])
     axis = 0.5 * math.atan2(2.0 * s.power[1], s.power[0] - s.power[2])
-    if math.cos(axis) * s.fore[0] + math.sin(axis) * s.fore[1] < 0.0:
+    if s.offset_n > SETTLED and math.cos(axis - s.offset) < 0.0:  # the end of the axis that was fore before
+        axis += math.pi
+    fore = (math.cos(axis) * s.fore[0] + math.sin(axis) * s.fore[1]) / max(
+        math.hypot(s.fore[0], s.fore[1]), 1e-300
+    )
+    if fore < (-ABOUT_FACE if s.offset_n > SETTLED else 0.0):
         axis += math.pi
     s.offset = attitude.wrap(axis)
     spread = math.sqrt((s.power[0] - s.power[2]) ** 2 + 4.0 * s.power[1] ** 2)

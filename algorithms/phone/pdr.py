@@ -135,7 +135,7 @@ class PhoneFusedParams(PdrParams, frozen=True, forbid_unknown_fields=True, kw_on
     ] = 1.0
     gnss_slow_share: Annotated[
         float, meta("Share of a fix's variance that changes slowly", "1", "ours", ge=0.0, lt=1.0)
-    ] = 0.85
+    ] = 0.9
     gnss_tau_s: Annotated[float, meta("Correlation time of that share", "s", "ours", gt=0.0)] = 40.0
     outlier: Annotated[float, meta("Probability that a fix is none", "1", "ours", gt=0.0, lt=0.5)] = 0.02
 
