@@ -39,12 +39,16 @@ def closure(view: RunView) -> dict[str, float]:
 
 
 def distance(view: RunView) -> dict[str, float]:
-    """Way walked, horizontal: from stance to stance, and along the raw track (the source's ED, eq 4.4)."""
+    """Way walked, horizontal: from stance to stance (of a phone, the sum of its steps), and along the raw track.
+
+    The source's ED is eq 4.4.
+    """
     found: dict[str, float] = {}
     steps = view.table("step")
     if steps is not None:
         found["steps"] = float(steps.height)
         if view.truth.steps:
+            found["steps_difference"] = steps.height - view.truth.steps
             found["steps_error_percent"] = 100.0 * abs(steps.height - view.truth.steps) / view.truth.steps
     base = view.whole or view
     track = base.track
@@ -57,8 +61,14 @@ def distance(view: RunView) -> dict[str, float]:
     at = np.searchsorted(track.t_ns, middles)
     if at.size:
         found["distance_m"] = _length(middles, track.position[at], view.spans)
+    elif (
+        steps is not None and "length_m" in steps.columns and np.isfinite(steps["length_m"].to_numpy()).all()
+    ):
+        found["distance_m"] = float(steps["length_m"].sum())
     found["path_m"] = _length(track.t_ns, track.position, view.spans)
     if (length := view.truth.length_m) is not None:
+        if "distance_m" in found:
+            found["distance_difference_m"] = found["distance_m"] - length
         for name, metres in (
             ("distance_error_percent", found.get("distance_m")),
             ("path_error_percent", found["path_m"]),
@@ -107,6 +117,9 @@ def reference(view: RunView) -> dict[str, float]:
         "position_error_max_m": float(error.max()),
         "position_error_end_m": float(error[-1]),
     }
+    if (start := view.compared("origin")) is not None and not view.scattered:
+        x, y = np.abs(start.error[-1, :2]).tolist()
+        found |= {"origin_error_end_x_m": x, "origin_error_end_y_m": y}
     if compared.yaw_error is not None:
         drift = np.degrees(wrap(compared.yaw_error - compared.yaw_start))
         found["heading_rmse_deg"] = float(np.sqrt(np.mean(drift**2)))

@@ -261,6 +261,76 @@ def tracks(cells: Sequence[StudyCell], config: cfg.StudyConfig) -> Figure | None
     return figure
 
 
+WALKS_A_PANEL = 6
+"""Tracks of one person in a panel, as in the phone dissertation (figures 4.12 and 4.13)."""
+
+
+def by_walk(cells: Sequence[StudyCell], config: cfg.StudyConfig, column: str, unit: str) -> Figure | None:
+    """Estimated and true figure of every walk above, their difference below; a column a configuration.
+
+    ``column`` is a metric with a signed ``<name>_difference…`` beside it (phone dissertation, figures 4.10, 4.11).
+    """
+    difference = column.replace("_m", "_difference_m") if column.endswith("_m") else f"{column}_difference"
+    known = [c for c in cells if c.status == "ok" and {column, difference} <= set(c.metrics)]
+    if not known:
+        return None
+    configurations = list(dict.fromkeys(c.configuration for c in known))
+    figure = Figure(figsize=(1.2 + 3.6 * len(configurations), 4.6))
+    axes = figure.subplots(2, len(configurations), squeeze=False, sharex="col", height_ratios=(2, 1))
+    for k, configuration in enumerate(configurations):
+        own = [c for c in known if c.configuration == configuration]
+        x = np.arange(1, len(own) + 1)
+        value = np.array([c.metrics[column] for c in own])
+        error = np.array([c.metrics[difference] for c in own])
+        above, below = axes[:, k]
+        above.bar(x - 0.2, value - error, 0.4, color=GREY, label="true")
+        above.bar(x + 0.2, value, 0.4, color=colour(0), label="estimated")
+        below.bar(x, error, 0.6, color=colour(1))
+        below.axhline(0, color="black", linewidth=0.6)
+        above.set_title(f"{configuration}, mean |error| {np.abs(error).mean():.3g} {unit}", fontsize=9)
+        below.set_xlabel("walk")
+        if k == 0:
+            above.set_ylabel(unit)
+            below.set_ylabel(f"error ({unit})")
+            above.legend(fontsize=8, loc="lower right")
+    figure.suptitle(f"{column.removesuffix('_m').replace('_', ' ')} by walk, {known[0].label}")
+    return figure
+
+
+def walk_panels(cells: Sequence[StudyCell], config: cfg.StudyConfig) -> Figure | None:
+    """Six tracks a panel, in the order of the walks; a row a configuration, one filter."""
+    known = [c for c in cells if c.status == "ok" and len(c.positions) > 1]
+    rows = {
+        name: [c for c in known if c.configuration == name]
+        for name in dict.fromkeys(c.configuration for c in known)
+    }
+    wide = max((-(-len(own) // WALKS_A_PANEL) for own in rows.values()), default=0)
+    if not wide:
+        return None
+    figure = Figure(figsize=(0.8 + 2.6 * wide, 0.9 + 2.6 * len(rows)))
+    axes = figure.subplots(len(rows), wide, squeeze=False)
+    for i, (name, own) in enumerate(rows.items()):
+        for k in range(wide):
+            ax, part = axes[i, k], own[k * WALKS_A_PANEL : (k + 1) * WALKS_A_PANEL]
+            if not part:
+                ax.set_axis_off()
+                continue
+            for j, cell in enumerate(part):
+                ax.plot(*cell.positions[:, :2].T, color=colour(j), linewidth=1.0)
+                ax.plot(*cell.positions[-1, :2], "o", color=colour(j), markersize=3)
+            ax.plot(0, 0, "+", color="black", markersize=8)
+            ax.set_aspect("equal", adjustable="datalim")
+            first = k * WALKS_A_PANEL + 1
+            ax.set_title(f"{name}, walks {first}–{first + len(part) - 1}", fontsize=8)
+            ax.tick_params(labelsize=7)
+            if k == 0:
+                ax.set_ylabel("y (m)")
+            if i == len(rows) - 1:
+                ax.set_xlabel("x (m)")
+    figure.suptitle(f"Tracks walk by walk, {known[0].label}")
+    return figure
+
+
 def _overlay(ax: Axes, cells: Sequence[StudyCell], face: str, middle: np.ndarray, reach: float) -> None:
     """Draw one panel of tracks."""
     alpha = min(1.0, max(0.15, 4 / max(1, len(cells))))

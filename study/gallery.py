@@ -79,10 +79,35 @@ def drawings(
         if any(c.clipped for c in own):
             caption += " Dashed: clipped input."
         drawn.append(Drawing("tracks", "tracks", caption, "tracks", (own, config)))
+    drawn += _walk_by_walk(own, config)
     single = nees.filter(pl.col("configuration") != "", *at_base(base))
     if len(single):
         caption = f"Mean NEES over the walks{fixed}; above the band a filter is too sure of itself."
         drawn.append(Drawing("consistency", "consistency", caption, "consistency", (single, config)))
+    return drawn
+
+
+def _walk_by_walk(cells: Sequence[StudyCell], config: cfg.StudyConfig) -> list[Drawing]:
+    """Return figures walk by walk where the study asks for signed differences, one a filter."""
+    wanted = [
+        (column, unit)
+        for column, difference, unit in (
+            ("steps", "steps_difference", "steps"),
+            ("distance_m", "distance_difference_m", "m"),
+        )
+        if any(m.column == difference for m in config.metrics)
+    ]
+    drawn: list[Drawing] = []
+    for label in dict.fromkeys(c.label for c in cells) if wanted else ():
+        own = [c for c in cells if c.label == label]
+        stem = re.sub(r"[^a-z0-9]+", "-", label.lower()).strip("-")
+        for column, unit in wanted:
+            caption = f"{label}: estimated and true {column.removesuffix('_m')} of every walk, and their difference."
+            arguments = (own, config, column, unit)
+            drawn.append(Drawing(f"walks-{column}-{stem}", "box", caption, "by_walk", arguments))
+        if config.tracks:
+            caption = f"{label}: local tracks, six walks a panel: start at the cross, dots where they end."
+            drawn.append(Drawing(f"walk-tracks-{stem}", "tracks", caption, "walk_panels", (own, config)))
     return drawn
 
 

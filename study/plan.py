@@ -244,12 +244,19 @@ def _source(recordings: cfg.Recordings, name: str, path: Path, code: str) -> Stu
     )
 
 
+def _walks_of(label: str, count: Any) -> int:
+    if not isinstance(count, int) or isinstance(count, bool) or count < 1:
+        raise UsageError(f"simulate.configurations.{label}: walks = {count!r} is no whole number above 0")
+    return count
+
+
 def _walks(simulate: cfg.Simulate, code: str) -> list[StudyRecording]:
     walks: list[StudyRecording] = []
     several = len(simulate.scenarios) > 1
     for scenario in simulate.scenarios:
-        for label, sensor in simulate.configurations.items():
-            for number in range(1, simulate.walks + 1):
+        for label, own in simulate.configurations.items():
+            sensor = {k: v for k, v in own.items() if k != "walks"}
+            for number in range(1, _walks_of(label, own.get("walks", simulate.walks)) + 1):
                 seed = simulate.seed + len(walks)
                 draw = random.Random(seed)
                 varied = {k: draw.uniform(*simulate.vary[k]) for k in sorted(simulate.vary)}

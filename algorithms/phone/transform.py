@@ -41,10 +41,19 @@ class TransformParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     weighted: Annotated[bool, meta("Weigh fixes by their stated variance", source="ours")] = False
 
 
+def _turned(half: Any, quat: Any) -> tuple[float, ...]:
+    """Return an orientation (w, x, y, z) turned about the vertical; ``half``: cosine, sine of half the angle."""
+    (c, s), (w, x, y, z) = half.tolist(), quat.tolist()
+    return c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w
+
+
 class PhoneTransform(PlainEstimator):
     """Horn's transform in the plane from the local track to UTM, over the whole walk. Never a reflection.
 
-    The stated deviation is the root of the mean squared residual an axis.
+    The stated deviation is the root of the mean squared residual an axis. ``rotation_rad`` takes the local track
+    to grid north, anticlockwise; a track whose y is true north is turned by the grid convergence there
+    (``convergence_rad``), which is no error: ``north_error_rad`` is what is left. ``pose`` is in metres east and
+    true north of the first fix, as of ``phone.fused``: grid convergence and point scale are taken off again.
     """
 
     name: ClassVar[str] = "phone.transform"
@@ -53,7 +62,7 @@ class PhoneTransform(PlainEstimator):
     offline: ClassVar[bool] = True
     Params = TransformParams
     inputs = (
-        Input("pose", POSE.schema, ("pos_x", "pos_y", "pos_z"), stage="phone.pdr-source"),
+        Input("pose", POSE.schema, POSE.columns, stage="phone.pdr-source"),
         Input("gnss", "sensor_msgs/msg/NavSatFix", ALL_COLUMNS),
     )
     outputs = (
@@ -71,6 +80,8 @@ class PhoneTransform(PlainEstimator):
                 "pairs",
                 "zone",
                 "convergence_rad",
+                "point_scale",
+                "north_error_rad",
             ),
         ),
     )
@@ -132,14 +143,18 @@ class PhoneTransform(PlainEstimator):
         except AlgorithmError as error:
             self.failed = str(error)
             return []
-        return self._results(t, found.apply(local), found, grid, len(when), float(np.nanmean(seen[:, 2])))
+        quats = np.array([v[3:] for _, v in poses], dtype=np.float64)
+        alt = float(np.nanmean(seen[:, 2])) if np.isfinite(seen[:, 2]).any() else math.nan
+        return self._results(t, found.apply(local), quats, found, grid, len(when), alt)
 
     def _results(
-        self, t: Any, place: Any, found: Any, grid: geodesy.Grid, pairs: int, alt: float
+        self, t: Any, place: Any, quats: Any, found: Any, grid: geodesy.Grid, pairs: int, alt: float
     ) -> list[Result]:
         lat, lon = geodesy.from_utm(grid.zone, grid.south, place[:, 0], place[:, 1])
         sd, origin = found.rms / math.sqrt(2), np.array([grid.east_m[0], grid.north_m[0]])
         turn = math.atan2(found.rotation[1, 0], found.rotation[0, 0])
+        convergence, scale = float(grid.convergence_rad[0]), float(grid.scale[0])
+        north_error = math.remainder(turn - convergence, 2 * math.pi)
         about = (
             turn,
             found.scale,
@@ -147,12 +162,18 @@ class PhoneTransform(PlainEstimator):
             found.rms,
             pairs,
             grid.zone,
-            float(grid.convergence_rad[0]),
+            convergence,
+            scale,
+            north_error,
         )
+        c, w = math.cos(convergence) / scale, math.sin(convergence) / scale
+        ground = (place - origin) @ np.array([[c, -w], [w, c]])
+        half = np.array([math.cos(north_error / 2), math.sin(north_error / 2)])
         out = [Result("transform", int(t[0]), about)]
         for k, when in enumerate(t.tolist()):
-            east, north = (place[k] - origin).tolist()
-            out.append(Result("pose", when, (east, north, 0.0, 1.0, 0.0, 0.0, 0.0)))
+            east, north = ground[k].tolist()
+            quat = _turned(half, quats[k])
+            out.append(Result("pose", when, (east, north, 0.0, *quat)))
             out.append(Result("fix", when, (float(lat[k]), float(lon[k]), alt, sd, sd, float("nan"))))
         return out
 
