@@ -82,6 +82,46 @@ def test_android_text_gives_fixes_once(tmp_path: Path, walk: PhoneWalk) -> None:
     assert imported.metadata["device"]["header SamplingTime"] == "50ms"
 
 
+@pytest.mark.parametrize("empty", ["", ",,,", ",null,null,null", ",NaN,NaN,NaN"])
+def test_android_text_before_and_without_any_fix(tmp_path: Path, empty: str) -> None:
+    """Rows before the first fix end after the field, or have empty places; nothing of them is lost."""
+    row = "{},-0.39,3.73,8.64,-16.7,-17.3,-15.6{}#"
+    fix = ",-22.826485,-47.076044,645.1"
+    lines = [row.format(1489060307326 + 50 * k, empty if k < 40 else fix) for k in range(60)]
+    path = tmp_path / "a.txt"
+    path.write_text("@Date: x\n" + "\n".join(lines))
+    assert [c.name for c in recognise(path)] == ["android-text"]
+    _, tables, report = read(AndroidText(), path)
+    assert tables["/phone/acc"].height == tables["/phone/mag"].height == 60
+    assert tables["/phone/gnss"].height == 1
+    assert report.rows_dropped == 0
+    path.write_text("\n".join(lines[:40]))
+    assert [c.name for c in recognise(path)] == ["android-text"]
+    _, tables, _ = read(AndroidText(), path)
+    assert tables["/phone/acc"].height == 40
+    assert "/phone/gnss" not in tables
+
+
+def test_each_sample_is_of_exactly_one_format(tmp_path: Path, walk: PhoneWalk) -> None:
+    """Every importer of phones looks at every sample, and those of the other domains look as well."""
+    made = {
+        "android-text": samples.android_text(tmp_path / "a.txt", walk),
+        "androsensor": samples.androsensor(tmp_path / "b.csv", walk),
+        "sensortester": samples.sensortester(tmp_path / "c.csv", walk),
+        "indoor-location": samples.indoor_location(tmp_path / "d.txt", walk),
+        "android-ns": samples.android_ns(tmp_path / "e", walk),
+        "rtk-pos": samples.rtk_pos(tmp_path / "f.pos", walk),
+        "getsensordata": samples.getsensordata(tmp_path / "g.txt", walk),
+        "gnsslogger": samples.gnsslogger(tmp_path / "h.txt", walk),
+        "gpx": samples.gpx(tmp_path / "i.gpx", walk),
+        "kml": samples.kml(tmp_path / "j.kml", walk),
+        "phyphox": samples.phyphox(tmp_path / "k", walk),
+        "sensor-logger": samples.sensor_logger(tmp_path / "l", walk),
+    }
+    for name, path in made.items():
+        assert [c.name for c in recognise(path)] == [name]
+
+
 def test_android_text_packed_fixes_are_no_track(tmp_path: Path) -> None:
     row = "{},-0.39,3.73,8.64,-16.7,-17.3,-15.6,{:.7f},-47.07604455#"
     lines = [row.format(1489060307326 + 53 * k, -22.8264 - (1e-4 * min(k, 4))) for k in range(60)]

@@ -33,8 +33,13 @@ from ..phonelog import (
 from ..text import start_of
 from ..typedrows import typed_blocks
 
-_ROW = re.compile(rb"(?m)^\d{12,14}(?:,\s*-?[0-9.eE+-]+){8,9}\s*#\s*$")
+_CELL = rb",[ \t]*(?:-?[0-9.eE+-]+|(?i:nan|null)|)[ \t]*"
+_ROW = re.compile(rb"(?m)^\d{12,14}(?:" + _CELL + rb"){6}(?:(?:" + _CELL + rb"){2,3})?#[ \t]*$")
+_KIND = r"^\d{12,14}(?:,[^,]*){6}(,?)"
+"""Kind of a row: whether a comma, and so the places of a fix, follow its first seven cells."""
 NAMES = ("t", "ax", "ay", "az", "mx", "my", "mz", "lat", "lon", "alt")
+WITHOUT_FIX = 7
+"""Cells of a row that has no place for a fix."""
 
 
 class AndroidTextOptions(CommonOptions, frozen=True, kw_only=True):
@@ -49,15 +54,15 @@ class AndroidText:
     Options = AndroidTextOptions
 
     def sniff(self, head: bytes, path: Path) -> float:
-        """Rows of nine or ten numbers that end in #."""
+        """Rows of seven (before the first fix), nine or ten cells that end in #."""
         return 0.95 if len(_ROW.findall(head.replace(b"\r\n", b"\n"))) >= 2 else 0.0
 
     def read(self, paths: Sequence[Path], options: AndroidTextOptions) -> Import:
         """Read one file."""
         path = one_file(paths, self.name)
         head = start_of(path, 65536).replace(b"\r\n", b"\n")
-        row = _ROW.search(head)
-        names = NAMES[: row[0].count(b",") + 1] if row else NAMES
+        widths = {row[0].count(b",") + 1 for row in _ROW.finditer(head)} - {WITHOUT_FIX}
+        names = NAMES[: max(widths, default=len(NAMES))]
         report = ReportBuilder()
         attachments: list[SourceAttachment] = []
         places = {k: k for k in ("lat", "lon", "alt") if k in names}
@@ -94,16 +99,22 @@ def _blocks(
 ) -> Iterator[tuple[str, pl.DataFrame]]:
     tables = typed_blocks(
         path,
-        r"^()\d{12,14},",
+        _KIND,
         ",",
-        lambda kind, width: names,
+        lambda kind, width: names if kind else names[:WITHOUT_FIX],
         report,
         required=lambda kind: "t",
         comment="@",
         ending="# \t",
     )
+    nothing = [pl.lit(float("nan")).alias(name) for name in names[WITHOUT_FIX:]]
     for block in tables:
-        for frame in block.values():
-            yield from stream.push(frame.with_columns(t=whole_ns(frame["t"], 1e3)))
+        frames = [
+            (frame if kind else frame.with_columns(nothing)).select("line", *names)
+            for kind, frame in block.items()
+        ]
+        if frames:
+            together = pl.concat(frames).sort("line")
+            yield from stream.push(together.with_columns(t=whole_ns(together["t"], 1e3)))
     yield from stream.finish()
     require_rows(path, [stream])
