@@ -37,7 +37,8 @@ def view(
     figure : Path
         Write a figure (.png or .svg) instead of opening a viewer.
     kind : str
-        Which figure: walk, signals, steps, heading, fixes, floor, radio, error, joints, jumps, strides.
+        Which figure: walk, signals, steps, detector, heading, fixes, transform, map, floor, radio, error, joints,
+        jumps, strides.
     force : bool
         Replace an existing file.
     """

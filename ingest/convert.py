@@ -31,6 +31,7 @@ from .legchecks import LegWatch
 from .mapping import mapping_format
 from .radio import RadioWatch, addresses
 from .truth import WALK_FACTS, TruthFile, as_text, read_truth, walk_facts
+from .underlay import is_underlay, read_underlay
 
 T = TypeVar("T")
 
@@ -108,7 +109,8 @@ def convert(
     for k, path in enumerate(sources):
         if any(path.resolve() == earlier.resolve() for earlier in sources[:k]):
             raise UsageError(f"{path}: given twice; name each input once")
-    sources, beside = _apart(sources)
+    under = [p for p in sources if is_underlay(p)]
+    sources, beside = _apart([p for p in sources if p not in under])
     facts_of_walk = walk_facts({k: chosen.pop(k) for k in WALK_FACTS if k in chosen} | dict(truth or {}))
     place = {k.removeprefix("plan."): chosen.pop(k) for k in list(chosen) if k.startswith("plan.")}
     mapped = None
@@ -130,6 +132,8 @@ def convert(
         settings = registry.share_options(found, chosen)
         told = ReportBuilder()
         floor = read_floor(beside, place, told)
+        floor.attachments += read_underlay(under)
+        beside += under
         side_files = [read_truth(source.files[0]) for source in found]
         facts = {
             "importer": ", ".join(dict.fromkeys(r.importer.name for r, _ in found)),
@@ -257,7 +261,9 @@ def _apart(sources: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     """Return the logs, and the anchor table and plan among what was given."""
     beside = [p for p in sources if kind_of(p) and not registry.recognise(p)]
     logs = [p for p in sources if p not in beside]
-    if beside and not logs:
+    if not logs:
+        if not beside:
+            raise UsageError("what lies under a map goes into a recording beside a log; give the log as well")
         raise UsageError(
             f"{beside[0]}: an anchor table or plan goes into a recording beside a log; give the log as well"
         )

@@ -14,7 +14,7 @@ from marcha.recording.errors import UsageError
 from .viz_walks import indoor, leg, phone
 
 KINDS = {
-    "phone": ("signals", "steps", "heading", "fixes", "error"),
+    "phone": ("signals", "steps", "heading", "fixes", "map", "error"),
     "indoor": ("floor", "radio", "error"),
     "leg": ("signals", "joints", "cycles", "jumps", "strides"),
 }
@@ -32,7 +32,7 @@ def recs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, mr.Recording]:
 
 def test_every_figure_is_drawn_and_has_a_line_of_help(recs: dict[str, mr.Recording]) -> None:
     known = viz.available_figures()
-    assert set(known) == {"walk", *(k for kinds in KINDS.values() for k in kinds)}
+    assert set(known) == {"walk", "detector", "transform", *(k for kinds in KINDS.values() for k in kinds)}
     assert all(known.values())
     for name, kinds in KINDS.items():
         for kind in kinds:

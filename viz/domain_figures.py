@@ -21,6 +21,7 @@ from . import style
 from .canvas import PLACES, is_estimate
 from .curve import Curve
 from .floor import Anchor, floor_plan, loaders_of
+from .phone_figures import detector, street_map, transform
 from .shapes import ELLIPSE95, circle, geo_circle, metres_a_degree
 from .stride_figures import strides
 from .text import printable
@@ -382,6 +383,9 @@ FIGURES: dict[str, Callable[[Recording, Any], None]] = {
     "steps": steps,
     "heading": heading,
     "fixes": fixes,
+    "detector": detector,
+    "transform": transform,
+    "map": street_map,
     "floor": floor,
     "radio": radio,
     "error": error,

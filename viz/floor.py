@@ -92,14 +92,14 @@ def loaders_of(rec: Recording) -> dict[str, Callable[[], bytes]]:
 
 def floor_plan(loaders: Loaders) -> FloorPlan:
     """Read anchors and plan. An attachment that cannot be read is left out, with a warning that names it."""
-    anchors: dict[str, Anchor] = _tried(loaders, ANCHORS, _anchors) or {}
-    outlines: list[Floats] = _tried(loaders, OUTLINES, _outlines) or []
+    anchors: dict[str, Anchor] = tried(loaders, ANCHORS, _anchors) or {}
+    outlines: list[Floats] = tried(loaders, OUTLINES, _outlines) or []
     name = next((n for n in PICTURES if n in loaders), "")
-    picture = _tried(loaders, name, _picture) if name else None
+    picture = tried(loaders, name, picture_of) if name else None
     corners = (0.0, 0.0, 0.0, 0.0)
     if picture is not None:
         shape = picture.shape
-        place = _tried(loaders, PLACE, lambda data: _corners(json.loads(data), shape))
+        place = tried(loaders, PLACE, lambda data: _corners(json.loads(data), shape))
         if place is None:
             warnings.warn(f"attachment {name}: not drawn, no {PLACE} says where it lies", stacklevel=2)
             picture = None
@@ -108,7 +108,8 @@ def floor_plan(loaders: Loaders) -> FloorPlan:
     return FloorPlan(anchors, outlines, picture, corners)
 
 
-def _tried(loaders: Loaders, name: str, read: Callable[[bytes], Any]) -> Any:
+def tried(loaders: Loaders, name: str, read: Callable[[bytes], Any]) -> Any:
+    """Return what ``read`` makes of an attachment; None where it is not there, or with a warning not readable."""
     if name not in loaders:
         return None
     try:
@@ -143,7 +144,7 @@ def _number(text: str) -> float:
 
 
 def _outlines(data: bytes) -> list[Floats]:
-    lines = [np.asarray(line, dtype=float)[:, :2] for line in _lines(json.loads(data))]
+    lines = [np.asarray(line, dtype=float)[:, :2] for line in geojson_lines(json.loads(data))]
     lines = [line for line in lines if len(line) > 1 and np.isfinite(line).all()]
     if not lines:
         return []
@@ -155,18 +156,18 @@ def _outlines(data: bytes) -> list[Floats]:
     return lines
 
 
-def _lines(node: Any) -> Iterator[Any]:
+def geojson_lines(node: Any) -> Iterator[Any]:
     """Yield every line and ring of a GeoJSON object."""
     kind = node.get("type")
     if kind == "FeatureCollection":
         for feature in node["features"]:
-            yield from _lines(feature)
+            yield from geojson_lines(feature)
     elif kind == "Feature":
         if node.get("geometry"):
-            yield from _lines(node["geometry"])
+            yield from geojson_lines(node["geometry"])
     elif kind == "GeometryCollection":
         for geometry in node["geometries"]:
-            yield from _lines(geometry)
+            yield from geojson_lines(geometry)
     elif kind == "LineString":
         yield node["coordinates"]
     elif kind in ("Polygon", "MultiLineString"):
@@ -176,7 +177,8 @@ def _lines(node: Any) -> Iterator[Any]:
             yield from polygon
 
 
-def _picture(data: bytes) -> np.ndarray:
+def picture_of(data: bytes) -> np.ndarray:
+    """Return a picture as colours, shape (h, w, 3)."""
     from PIL import Image
 
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))

@@ -11,6 +11,7 @@ import rerun as rr
 from .. import style
 from ..canvas import OVERVIEW, Floats, Times, columns_of
 from ..shapes import geo_circle
+from ..underlay import map_underlay
 from .common import General
 
 MAP = "map"
@@ -41,6 +42,11 @@ class Fix(General):
         self.points, self.circles = f"{self.path}/map/fixes", f"{self.path}/map/accuracy"
         canvas.static(self.points, rr.GeoPoints.from_fields(colors=color, radii=rr.Radius.ui_points(4.0)))
         canvas.show("map", self.points, tab=OVERVIEW, panel=MAP, owner=self.owner, past=True)
+        streets = map_underlay(canvas.attachments).streets
+        if streets:  # one path for all channels: drawn once
+            grey = rr.GeoLineStrings(lat_lon=streets, colors=(120, 120, 120), radii=rr.Radius.ui_points(1.2))
+            canvas.static("/map/streets", grey)
+            canvas.show("map", "/map/streets", tab=OVERVIEW, panel=MAP, owner=self.owner)
         self.accuracy = set(SD) <= set(self.channel.columns)
         if self.accuracy:
             thin = rr.Radius.ui_points(0.7)
