@@ -53,7 +53,6 @@ def source_stages(t_s: FloatArray, norm: FloatArray) -> SourceStages:
     upper, lower = limits(norm, half)
     peaks, valleys = extremes(norm, half)
     high, low = peaks[norm[peaks] > upper[peaks]], valleys[norm[valleys] < lower[valleys]]
-    kept = [places[thin(t_s[places])] if len(places) else places for places in (high, low)]
-    return SourceStages(
-        upper, lower, peaks, valleys, high, low, *kept, np.asarray(source_steps(t_s, norm, half))
-    )
+    kept_high, kept_low = high[thin(t_s[high])], low[thin(t_s[low])]
+    steps = np.asarray(source_steps(t_s, norm, half))
+    return SourceStages(upper, lower, peaks, valleys, high, low, kept_high, kept_low, steps)
