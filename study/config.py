@@ -95,8 +95,7 @@ class Simulate(_Table, frozen=True, kw_only=True):
     vary : dict of str to [low, high]
         Options drawn uniformly for each walk from its seed (walking speed, stride …).
     configurations : dict of str to dict
-        Sensor configurations: label to the simulator's options (full scales …). ``walks`` among them is the
-        number of this configuration's walks, where it is another one.
+        Sensor configurations: label to the simulator's options (full scales …), ``walks`` for a number of its own.
     """
 
     scenarios: list[str]
