@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Iterable
 from typing import Any
 
@@ -24,6 +26,7 @@ from marcha.algorithms import (
 from marcha.algorithms.numerics.compiled import compiled
 from marcha.recording import MarchaError, UsageError
 from marcha.replay import Engine, GapPolicy, LiveSource, TableSink, plan_runs, replay
+from numba import njit
 
 from .event_loop import drive
 from .replay_helpers import ACC, IMU, STEP_NS, VALUES, MemorySource, channel, run_all, same_bits, table
@@ -456,3 +459,39 @@ def test_the_context_holds_what_the_recording_says() -> None:
     assert context.metadata["device"]["rate"] == "100"
     assert context.channels["imu"][0].topic == "/p/imu"
     assert context.rate_hz("imu") == 100.0
+
+
+def test_compiling_is_no_part_of_a_runs_time() -> None:
+    """A kernel that was never called: its compilation takes far longer than its loop, and is not in it."""
+
+    @njit(_nrt=False)
+    def never_called(
+        state: Any,
+        inputs: Any,
+        channels: Any,
+        t_ns: Any,
+        values: Any,
+        out_message: Any,
+        out_t_ns: Any,
+        out: Any,
+    ) -> int:
+        for i in range(len(inputs)):
+            state[0].angle += values[i, 0]
+            out[i, 0], out[i, 1], out[i, 2] = state[0].angle, 0.0, math.nan
+            out_message[i], out_t_ns[i] = i, t_ns[i]
+        return len(inputs)
+
+    class Fresh(LegKernel):
+        name = "fresh"
+        run = staticmethod(never_called)
+
+    t_ns = [k * STEP_NS for k in range(1, 51)]
+    readings = {c: [0.1] * len(t_ns) for c in ACC}
+    source = MemorySource(
+        [(channel(f"/leg/{name}", IMU, ACC), table(t_ns, readings)) for name in ("thigh", "shank")], 7
+    )
+    begin = time.perf_counter()
+    result, _ = run_all(source, [Fresh()])
+    whole_s = time.perf_counter() - begin
+    assert result.runs[0].samples == 100
+    assert result.runs[0].loop_s < 0.2 * whole_s
