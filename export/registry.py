@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -12,6 +11,7 @@ import msgspec
 
 from ..recording import Recording
 from ..recording.errors import UsageError
+from ..recording.plugins import plugins
 from .contract import Exporter
 
 GROUP = "marcha.exporters"
@@ -19,17 +19,7 @@ GROUP = "marcha.exporters"
 
 def available() -> dict[str, type[Exporter]]:
     """Return the exporters that are installed, by name; a broken plug-in is a warning that names it."""
-    found: dict[str, type[Exporter]] = {}
-    for point in entry_points(group=GROUP):
-        try:
-            found[point.name] = point.load()
-        except Exception as error:  # a stranger's module may raise anything; it must not stop the others
-            reason = " ".join(str(error).split())
-            warnings.warn(
-                f"exporter {point.name} ({point.value}) cannot be loaded: {type(error).__name__}: {reason}",
-                stacklevel=2,
-            )
-    return dict(sorted(found.items()))
+    return {name: plugin.part for name, plugin in plugins(entry_points, GROUP, "exporter").items()}
 
 
 def export(

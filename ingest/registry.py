@@ -6,7 +6,7 @@ import contextlib
 import warnings
 from collections.abc import Mapping, Sequence
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,6 +14,7 @@ import msgspec
 
 from ..recording.errors import MarchaError, UsageError
 from ..recording.files import require_regular
+from ..recording.plugins import plugins
 from ..recording.scratch import scratch_folder
 from .archive import UNPACK_LIMIT_GB, is_zip, unpack
 from .contract import HEAD_BYTES, CommonOptions, Importer
@@ -89,21 +90,15 @@ class Candidate(msgspec.Struct, frozen=True):
 def importers() -> dict[str, Registered]:
     """Return all importers by name; a broken plug-in is a warning with its name."""
     found: dict[str, Registered] = {}
-    for point in sorted(entry_points(group=GROUP), key=lambda p: p.name):
-        try:
-            importer = point.load()()
-            _check(importer)
-        except Exception as error:
-            warnings.warn(f"importer plug-in {_label(point)} cannot be used: {error!r}", stacklevel=2)
-            continue
-        if importer.name in found:
-            first = found[importer.name].source
+    for plugin in plugins(entry_points, GROUP, "importer", _checked).values():
+        name = plugin.part.name
+        if name in found:
             warnings.warn(
-                f"importer plug-in {_label(point)} is left out: {first} has {importer.name!r} already",
+                f"importer plug-in {name} ({plugin.source}) is left out: {found[name].source} has the name already",
                 stacklevel=2,
             )
             continue
-        found[importer.name] = Registered(importer, _distribution(point))
+        found[name] = Registered(plugin.part, plugin.source)
     return found
 
 
@@ -361,20 +356,15 @@ def _unpack(path: Path, stack: contextlib.ExitStack, limit_gb: float) -> Path:
     return folder
 
 
-def _check(importer: Any) -> None:
+def _checked(kind: Any) -> Any:
+    """Return an importer of a registered class; TypeError where it is none."""
+    importer = kind()
     for field in ("name", "title", "Options", "sniff", "read"):
         if not hasattr(importer, field):
             raise TypeError(f"it has no {field!r}")
     if not issubclass(importer.Options, CommonOptions):
         raise TypeError("its Options do not inherit from CommonOptions")
-
-
-def _distribution(point: EntryPoint) -> str:
-    return f"{point.dist.name} {point.dist.version}" if point.dist else "unknown"
-
-
-def _label(point: EntryPoint) -> str:
-    return f"{point.name!r} ({point.value}, {_distribution(point)})"
+    return importer
 
 
 def _info(registered: Registered) -> FormatInfo:

@@ -7,16 +7,14 @@ metric that applies but has no value is NaN. ``docs/replay.md`` lists every name
 
 from __future__ import annotations
 
-import sys
-import warnings
 from collections.abc import Callable, Mapping
-from functools import lru_cache
 from importlib import metadata
 
 import numpy as np
 import polars as pl
 
 from ..algorithms.contract import FloatArray
+from ..recording.plugins import plugins
 from .alignment import IntArray, Transform, match, wrap
 from .trajectory import inside
 from .view import VELOCITY, RunView
@@ -212,16 +210,6 @@ def nees_bounds(runs: int, dof: int = 3, confidence: float = 0.95) -> tuple[floa
 
 def available_metrics() -> dict[str, Metric]:
     """Return every registered metric by name; a plug-in that does not load is a warning with its name."""
-    return dict(_metrics(metadata.entry_points, tuple(sys.path)))
-
-
-@lru_cache(maxsize=8)
-def _metrics(scan: Callable[..., metadata.EntryPoints], path: tuple[str, ...]) -> dict[str, Metric]:
-    """Load the metrics: a scan of what is installed takes 10 ms, so one a ``sys.path``, not one a run."""
-    found: dict[str, Metric] = {}
-    for entry in scan(group="marcha.metrics"):
-        try:
-            found[entry.name] = entry.load()
-        except Exception as error:
-            warnings.warn(f"metric plug-in {entry.name} ({entry.value}) does not load: {error}", stacklevel=2)
-    return found
+    return {
+        n: plugin.part for n, plugin in plugins(metadata.entry_points, "marcha.metrics", "metric").items()
+    }

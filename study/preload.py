@@ -6,21 +6,17 @@ Importing this module does it: that is how :mod:`multiprocessing` has a server p
 from __future__ import annotations
 
 import contextlib
-import gc
 import os
 
 from .executors import ESTIMATORS
 
 
 def _load() -> None:
-    gc.disable()  # modules are no garbage, and looking for some takes a tenth of the time
     from . import cells, figures  # noqa: F401
 
     for name in os.environ.get(ESTIMATORS, "").split():
         with contextlib.suppress(Exception):  # its first cell says what is wrong with it
             cells.warm(name)
-    gc.freeze()  # workers neither search what is loaded nor copy its pages for the marks of a search
-    gc.enable()
 
 
 _load()

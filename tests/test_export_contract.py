@@ -94,5 +94,5 @@ def test_unknown_format_names_those_that_there_are(tmp_path: Path) -> None:
 def test_a_broken_plugin_is_a_warning_with_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
     points = [EntryPoint("broken", "no.such.module:Exporter", registry.GROUP)]
     monkeypatch.setattr(registry, "entry_points", lambda group: points)
-    with pytest.warns(UserWarning, match="exporter broken"):
+    with pytest.warns(UserWarning, match="exporter plug-in broken"):
         assert available() == {}

@@ -356,12 +356,12 @@ def test_broken_plugins_are_warnings_with_their_names(walk: Path, tmp_path: Path
         assert "mpu6050-serial" in importers()
         convert(walk, tmp_path / "out.mcap")
     said = " ".join(str(w.message) for w in caught)
-    assert "'gone' (nowhere.at_all:Thing" in said
-    assert "'headless'" in said
+    assert "gone (nowhere.at_all:Thing" in said
+    assert "plug-in headless" in said
     assert "faulty failed to look at" in said
 
 
 def test_second_of_one_name_is_left_out(plugins: Any) -> None:
     plugins(twin=f"{__name__}:_Twin", twin2=f"{__name__}:_Twin")
-    with pytest.warns(UserWarning, match="'twin2'.*left out"):
+    with pytest.warns(UserWarning, match=r"twin2? .*left out"):
         assert "twin" in importers()

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
-from collections.abc import Callable
-from functools import lru_cache
-from importlib.metadata import EntryPoints, entry_points
+from importlib.metadata import entry_points
+from typing import Any
 
+from ..recording.plugins import plugins
 from .canvas import Canvas, ChannelLike
 from .views.base import View
 from .views.common import General
@@ -17,23 +16,13 @@ GROUP = "marcha.views"
 
 def available_views() -> dict[str, type[View]]:
     """Return every registered view by name; a plug-in that cannot be used is a warning with its name."""
-    return dict(_views(entry_points, tuple(sys.path)))
+    return {name: plugin.part for name, plugin in plugins(entry_points, GROUP, "view", _checked).items()}
 
 
-@lru_cache(maxsize=8)
-def _views(scan: Callable[..., EntryPoints], path: tuple[str, ...]) -> dict[str, type[View]]:
-    """Load the views, once a ``sys.path``: a scan of what is installed takes 10 ms."""
-    found: dict[str, type[View]] = {}
-    for point in sorted(scan(group=GROUP), key=lambda p: p.name):
-        try:
-            view = point.load()
-            if not (isinstance(view, type) and issubclass(view, View)):
-                raise TypeError("it is no subclass of marcha.viz.views.View")
-        except Exception as error:
-            warnings.warn(f"view plug-in {point.name} ({point.value}) cannot be used: {error}", stacklevel=2)
-            continue
-        found[point.name] = view
-    return found
+def _checked(view: Any) -> type[View]:
+    if not (isinstance(view, type) and issubclass(view, View)):
+        raise TypeError("it is no subclass of marcha.viz.views.View")
+    return view
 
 
 def views_of(canvas: Canvas, channel: ChannelLike) -> list[View]:
