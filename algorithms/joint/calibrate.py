@@ -69,8 +69,8 @@ class JointCalibrator(Calibrator):
 
     Values: ``hinges``, one per pair of neighbouring segments (``joint``, ``segments``, ``axes`` in both sensors'
     frames, ``axes_sd_deg``, ``positions_m`` from the joint's centre to each sensor, ``position_sd_m``, ``pairing``,
-    ``usable``, ``why``), and ``rot_sb_<segment>``, the rotation from the sensor's to the segment's frame (x flexion
-    axis, z long axis upwards, y = z × x), row by row.
+    ``gyr_bias_rad_s``, ``acc_bias_m_s2``, ``usable``, ``why``), and ``rot_sb_<segment>``, the rotation from the
+    sensor's to the segment's frame (x flexion axis, z long axis upwards, y = z × x), row by row.
     """
 
     name: ClassVar[str] = "joint"
@@ -168,6 +168,7 @@ class JointCalibrator(Calibrator):
             position_sd=float(w["pos_sd"]),
             pairing=float(w["pairing"]) if paired else 0.5,
             biases=np.zeros((2, 3)),
+            acc_biases=np.zeros((2, 3)),
         )
         stretches = unbroken([(s[upper], s[lower]) for s in spans if upper in s and lower in s])
         if p.band_hz > 0.0 and stretches:
@@ -196,6 +197,7 @@ class JointCalibrator(Calibrator):
             "position_sd_m": best.position_sd,
             "pairing": best.pairing,
             "gyr_bias_rad_s": best.biases.tolist(),
+            "acc_bias_m_s2": best.acc_biases.tolist(),
             "samples": len(rows),
             "cov": {
                 f"axis_{joint}_{segment}": best.axes_cov[i].tolist()

@@ -135,6 +135,13 @@ def joint_name(upper: str, lower: str) -> str:
     return JOINTS[a] if b == a + 1 and a >= 0 else f"{upper}-{lower}"
 
 
+def side_of(context: Context, segments: Sequence[str]) -> str:
+    """Return ``left_`` or ``right_`` where the channels are of one leg (``/leg/left_thigh/imu``), else empty."""
+    topics = [c.topic for name in segments for c in context.channels.get(name, ())]
+    parts = [part for topic in topics for part in topic.split("/")]
+    return next((s for s in ("left_", "right_") if any(part.startswith(s) for part in parts)), "")
+
+
 class JointEstimator(KernelEstimator):
     """Base of the joint estimators: which segments are there, the merging of their messages, remarks."""
 
@@ -175,10 +182,8 @@ class JointEstimator(KernelEstimator):
 
     @property
     def side(self) -> str:
-        """``left_`` or ``right_`` where the channels are of one leg (``/leg/left_thigh/imu``), else empty."""
-        topics = [c.topic for name in self.segments for c in self.context.channels.get(name, ())]
-        parts = [part for topic in topics for part in topic.split("/")]
-        return next((s for s in ("left_", "right_") if any(part.startswith(s) for part in parts)), "")
+        """``left_`` or ``right_`` where the channels are of one leg, else empty."""
+        return side_of(self.context, self.segments)
 
     def _lay(self, context: Context) -> None:
         s, p = self.state[0], self.params

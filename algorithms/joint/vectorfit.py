@@ -46,7 +46,7 @@ class Hinge(NamedTuple):
 
     ``axes``, ``positions`` (2, 3) in the sensors' frames, positions from the joint's centre to the sensor;
     ``axes_cov`` (2, 3, 3), ``axes_sd`` (2,) rad, ``position_sd`` m; ``pairing``: share of the worse pairing's cost in
-    both, 0.5 … 1; ``biases`` (2, 3) rad/s.
+    both, 0.5 … 1; ``biases`` of gyroscopes (rad/s) and ``acc_biases`` (m/s²), (2, 3).
     """
 
     axes: FloatArray
@@ -56,6 +56,7 @@ class Hinge(NamedTuple):
     position_sd: float
     pairing: float
     biases: FloatArray
+    acc_biases: FloatArray
 
 
 def basis(axis: FloatArray) -> FloatArray:
@@ -209,4 +210,5 @@ def fit(spans: Sequence[Span], axes: FloatArray, band_hz: float, sd_gyr: float, 
         position_sd=float(np.sqrt(max(0.0, 0.5 * sum(float(np.trace(s)) for s in spread)))),
         pairing=pairing,
         biases=p[GYR:ACC].reshape(2, 3),
+        acc_biases=p[ACC:POS].reshape(2, 3),
     )
