@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .ceiling import CeilingSearch
 from .contract import ReportBuilder
 
 FloatArray = NDArray[np.float64]
@@ -89,6 +90,8 @@ class SensorCheck:
         self._tail: NDArray[np.float64] | None = None
         self._rest: float | None = None
         self._rest_line: int | None = None
+        self._ceilings = {f"gyr_{axis}": CeilingSearch() for axis in "xyz"}
+        self._clipped: set[str] = set()
 
     def feed(self, values: Sequence[NDArray[Any]], lines: NDArray[np.int64]) -> None:
         """Look at a block: one array an axis, in the order of ``columns``, and each row's line."""
@@ -115,6 +118,7 @@ class SensorCheck:
                     self._rest = float(np.median(mean[quiet]))
                     self._rest_line = int(lines[quiet[0] * REST_ROWS])
         for axis, rate in zip("xyz", gyr, strict=False):
+            self._ceilings[f"gyr_{axis}"].feed(np.asarray(rate, np.float64), lines)
             wild = np.flatnonzero(np.abs(rate) > RATE_HIGH)
             if wild.size:
                 self._report.note(
@@ -150,6 +154,16 @@ class SensorCheck:
                         line=self._first_line,
                         subject=f"{self._subject} {self._columns[i]}",
                     )
+        for name, search in self._ceilings.items():
+            for ceiling, waves, line in search.found() if name not in self._clipped else ():
+                self._report.loss(
+                    "clipped",
+                    f"{self._subject} {name}: {waves} turns flatten near {ceiling:.3g} rad/s, below the nominal "
+                    "full scale: the true value is beyond it",
+                    count=waves,
+                    line=line,
+                    subject=f"{self._subject} {name}{'+' if ceiling > 0 else '-'}",
+                )
         if self._rest is not None and not REST_LOW <= self._rest <= REST_HIGH:
             g = self._rest / STANDARD_GRAVITY
             if 0.9 < self._rest < 1.1:
@@ -175,6 +189,7 @@ class SensorCheck:
             at = np.flatnonzero((v >= high) | (v <= low))
             if not at.size:  # a missing cell makes the extremes NaN
                 continue
+            self._clipped.add(name)
             self._report.loss(
                 "clipped",
                 f"{self._subject} {name}: at full scale (±{text}); the true value is beyond it",

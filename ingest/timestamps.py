@@ -20,6 +20,8 @@ SLIP_ROWS = 20
 GAP, LONG_GAP = 1.8, 10.0
 #: Intervals off the nominal one by more than this share (and more than one tick) are jitter.
 JITTER = 0.1
+#: Stamps are bursty where the mean interval is less than this share of the median.
+BURSTY = 0.92
 #: A counter that wraps goes on within this time of its last value; anything else is a step back.
 ROLLOVER_S = 3600.0
 
@@ -41,6 +43,9 @@ class TimestampRepair:
         to one nominal interval behind the last row (repair).
     ``gap``, ``jitter``
         intervals above 1.8 nominal ones, and intervals off by more than 10 %: reported, nothing is filled in.
+
+    ``bursty_stamps``
+        the mean interval is more than 8 % below the median: the mean is the nominal one.
 
     Parameters
     ----------
@@ -90,7 +95,7 @@ class TimestampRepair:
 
     @property
     def nominal_ns(self) -> int | None:
-        """Median interval of the first block, in nanoseconds; None before two rows were seen."""
+        """Usual interval of the first block, in nanoseconds; None before two rows were seen."""
         return None if self._nominal is None else self._nominal * self._tick_ns
 
     def stream(self, frames: Iterable[pl.DataFrame]) -> Iterator[pl.DataFrame]:
@@ -114,8 +119,7 @@ class TimestampRepair:
         ticks = frame["t"].to_numpy() + self._shift
         if self._nominal is None and ticks.size > 1:
             steps = np.diff(ticks)
-            steps = steps[steps > 0]
-            self._nominal = int(np.median(steps)) if steps.size else None
+            self._nominal = self._interval(steps[steps > 0], int(frame["line"][0]))
         steps = np.diff(ticks, prepend=ticks[:1] if self._last is None else self._last)
         if steps.size and (steps[1:].min(initial=1) <= 0 or steps[0] < 0 or steps.max() > self._jump):
             frame, ticks = self._settle(frame, ticks, steps, final)
@@ -148,6 +152,27 @@ class TimestampRepair:
             subject=f"{self._subject}beyond",
         )
         return frame.filter(good)
+
+    def _interval(self, steps: Int64Array, line: int) -> int | None:
+        """Return the sensor's interval: the median, or the mean where stamps come in bursts.
+
+        Readings that are stamped as they arrive, several at once, have many short intervals and some long ones:
+        their mean is the sensor's, their median is not. Lost rows make the mean longer, never shorter.
+        """
+        if not steps.size:
+            return None
+        median = float(np.median(steps))
+        mean = float(steps[steps <= LONG_GAP * median].mean())
+        if steps.size < 20 or mean > BURSTY * median:
+            return int(median)
+        self._report.note(
+            "bursty_stamps",
+            f"{self._subject}time stamps come in bursts: half of the intervals are longer than "
+            f"{self._text(int(median))}, their mean is {self._text(int(mean))}; the mean is taken for the sensor's",
+            line=line,
+            subject=self._subject,
+        )
+        return max(1, int(mean))
 
     @property
     def _jump(self) -> int:

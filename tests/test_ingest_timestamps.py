@@ -132,6 +132,27 @@ def test_gap_and_jitter_are_told_apart() -> None:
     assert not report.lossy
 
 
+def test_bursty_stamps_are_no_jitter_of_a_slower_sensor() -> None:
+    """Five in six intervals are 6 ticks, the sixth catches up: the sensor's own is 5, not 6."""
+    t = (1000 + np.cumsum(np.tile([6, 6, 6, 6, 6, 1], 40))).tolist()
+    out, _, report = run(t)
+    assert out == t
+    assert kinds(report)["bursty_stamps"] == 1
+    (jitter,) = [f for f in report.findings if f.kind == "jitter"]
+    assert "nominal 5 ms" in jitter.detail
+    (finding,) = [f for f in report.findings if f.kind == "bursty_stamps"]
+    assert "6 ms" in finding.detail
+    assert "5 ms" in finding.detail
+
+
+def test_lost_rows_are_not_bursts() -> None:
+    t = np.cumsum(np.where(np.arange(200) % 5 == 0, 20, 10)).tolist()
+    _, _, report = run(t)
+    assert "bursty_stamps" not in kinds(report)
+    (gap,) = [f for f in report.findings if f.kind == "gap"]
+    assert "nominal 10 ms" in gap.detail
+
+
 def test_long_gap_is_a_loss() -> None:
     t = steady(50) + steady(50, 1000 + 500 + 5000)
     out, _, report = run(t)
