@@ -160,7 +160,42 @@ def consistency(view: RunView) -> dict[str, float]:
     if velocity is not None:
         t_ns, error = velocity
         found |= _normalized(sigma, "vel", "velocity", t_ns, error @ compared.transform.rotation)
+    attitude = _attitude_error(view, compared.t_ns, compared.transform)
+    if attitude is not None:
+        found |= _normalized(sigma, "att", "attitude", compared.t_ns, attitude)
+        found["attitude_rmse_deg"] = float(np.degrees(np.sqrt(np.mean(np.sum(attitude**2, axis=1)))))
     return found
+
+
+SAME_BODY_DEG = 10.0
+"""deg: where estimate and reference start farther apart than this, they turn different bodies."""
+
+
+def _attitude_error(view: RunView, t_ns: IntArray, transform: Transform) -> FloatArray | None:
+    """Return attitude errors as small turns about the estimate's own n-axes, rad, shape (n, 3).
+
+    None where a side has no orientation, or where the reference's body is not the sensor's (markers on a shoe, say):
+    its constant offset is not known, and fitting it would hide the tilt at the start.
+    """
+    track, reference = view.track, view.reference_track
+    if track is None or reference is None or track.quat_wxyz is None or reference.quat_wxyz is None:
+        return None
+    from scipy.spatial.transform import Rotation
+
+    mine = np.searchsorted(track.t_ns, t_ns)
+    right = (
+        np.clip(np.searchsorted(reference.t_ns, t_ns), 1, len(reference) - 1)
+        if len(reference) > 1
+        else mine * 0
+    )
+    nearer = np.abs(reference.t_ns[right] - t_ns) <= np.abs(t_ns - reference.t_ns[right - 1])
+    theirs = np.where(nearer, right, right - 1)
+    here = Rotation.from_quat(track.quat_wxyz[mine], scalar_first=True)
+    there = Rotation.from_quat(reference.quat_wxyz[theirs], scalar_first=True)
+    error = (here * (Rotation.from_matrix(transform.rotation).inv() * there).inv()).as_rotvec()
+    if np.degrees(np.linalg.norm(error[0])) > SAME_BODY_DEG:
+        return None
+    return error
 
 
 def _normalized(

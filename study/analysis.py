@@ -301,7 +301,7 @@ def json_rows(frame: pl.DataFrame) -> list[dict[str, Any]]:
 
 
 #: Metrics that are NEES, with the dimension of the error.
-NEES = {"nees_position_end": 3, "nees_velocity_end": 3}
+NEES = {"nees_position_end": 3, "nees_velocity_end": 3, "nees_attitude_end": 3}
 
 
 def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:

@@ -64,7 +64,11 @@ class ReportContents(msgspec.Struct, frozen=True):
     toml: str
 
 
-NEES_TITLES = {"nees_position_end": "position at the end", "nees_velocity_end": "velocity at the end"}
+NEES_TITLES = {
+    "nees_position_end": "position at the end",
+    "nees_velocity_end": "velocity at the end",
+    "nees_attitude_end": "attitude at the end",
+}
 
 
 def mean_sd(row: dict[str, Any] | None) -> str:

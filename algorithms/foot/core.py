@@ -62,6 +62,7 @@ CORE: Fields = [
     ("lowest", "f8", (6,)),  # of acceleration and angular rate
     ("highest", "f8", (6,)),
     ("unknown_bias", "f8"),  # variance of a gyroscope bias that is no error state, rad²/s²
+    ("unknown_tilt", "f8"),  # variance of the tilt that an accelerometer's bias hides, rad²
     ("forward", "f8", (3,)),  # sum of the steps, each turned into b where it lands: the foot's direction
     ("lean", "f8", (2,)),  # of the horizontal position on the gyroscope's bias about the vertical, m s/rad
     ("steps", STEPS),
@@ -241,14 +242,19 @@ def _land(s: Any, out: FloatArray) -> None:
 def emit_sigma(s: Any, pos: int, vel: int, att: int, out: FloatArray) -> None:
     """Write the standard deviations of position, velocity and attitude, by their first error states.
 
-    ``s.unknown_bias`` is the variance of a gyroscope bias that is no error state: what it does to heading and
-    horizontal position is added (a considered state, its effect on the tilt is taken out by every stance).
+    Two errors are considered, not estimated. ``s.unknown_bias`` is the variance of a gyroscope bias that is no
+    error state: what it does to heading and horizontal position is added (every stance takes its effect on the
+    tilt out). ``s.unknown_tilt`` is the variance of the tilt at which a standing accelerometer with a bias seems
+    level: no stance can take that out; an accelerometer that is off by as much of gravity makes every way
+    longer or shorter by that share.
     """
     for i in range(3):
         if s.started:
             position, attitude = s.P[pos + i, pos + i], s.P[att + i, att + i]
+            position += s.unknown_tilt * s.pos[i] * s.pos[i]
             if i < 2:
                 position += s.unknown_bias * s.lean[i] * s.lean[i]
+                attitude += s.unknown_tilt
             else:
                 attitude += s.unknown_bias * s.verdict.navigated_s * s.verdict.navigated_s
             out[SIGMA + i] = math.sqrt(max(0.0, position))

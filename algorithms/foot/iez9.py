@@ -197,8 +197,9 @@ def believe_rest(s: Any, att: int) -> None:
         return
     a = s.rest.acc
     off = (math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2]) - s.gravity) / s.gravity
+    s.unknown_tilt = s.tilt * s.tilt + off * off
     for i in range(2):
-        s.P[att + i, att + i] = s.tilt * s.tilt + off * off
+        s.P[att + i, att + i] = s.unknown_tilt
 
 
 @inlined

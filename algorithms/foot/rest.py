@@ -30,6 +30,8 @@ PIECES = 4
 """Half seconds of a rest are looked at in steps of such pieces (s), so many at a time."""
 LEAST_SPREAD = 1e-4
 """rad/s: no sensor is quieter; keeps weights finite."""
+BIAS_CHANGE = 5e-4
+"""rad/s: what a rest cannot show, the bias' change from rest to walk (0.03 °/s: instability of industrial MEMS)."""
 
 PIECE = record_type(
     ("elapsed", "f8"),
@@ -152,7 +154,7 @@ def bias_of(rest: Any, bias: Any) -> None:
         n = rest.weights * rest.weights / rest.weights_squared
         length = PIECE_S * (PIECES + n - 1.0)
         # The sway of a standing foot lasts for about half a second: so far apart its means are independent.
-        variance = rest.sway / rest.weights * PIECES * PIECE_S / length + LEAST_SPREAD * LEAST_SPREAD
+        variance = rest.sway / rest.weights * PIECES * PIECE_S / length + BIAS_CHANGE * BIAS_CHANGE
         for i in range(3):
             bias[i] = rest.weighted[i] / rest.weights
     else:

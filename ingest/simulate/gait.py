@@ -32,6 +32,9 @@ BALL = np.array([0.12, 0.0, -0.08])
 HEEL = np.array([-0.14, 0.0, -0.08])
 """Heel against the box, in f (m): the foot rolls about it after heel strike."""
 
+STANCE_SHARE = 0.31
+"""Share of a walking stride that the foot stands."""
+
 _NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 _Positive = Annotated[float, msgspec.Meta(gt=0)]
 
@@ -53,6 +56,8 @@ class Style(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         Slow forward roll about the ball while the foot stands (deg); real feet do about 5. The truth still
         calls these samples ``still``: it is what a zero-velocity filter takes them for. Default 0: velocity
         is exactly zero.
+    stance_share : float
+        Share of the stride that the foot stands.
     strike_mm, strike_hz, strike_s : float
         Heel-strike transient: a burst of vertical vibration of this amplitude, frequency and length.
         Default amplitude 0.
@@ -64,6 +69,7 @@ class Style(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     roll_deg: float = 8.0
     clearance_m: _NonNegative = 0.07
     stance_roll_deg: _NonNegative = 0.0
+    stance_share: Annotated[float, msgspec.Meta(gt=0.02, lt=0.9)] = STANCE_SHARE
     strike_mm: _NonNegative = 0.0
     strike_hz: _Positive = 40.0
     strike_s: _Positive = 0.04
@@ -138,7 +144,10 @@ class GaitModel:
         self.durations = durations
         self.gravity = gravity
         self.style = style
-        off, swing, slap = self.SHARES if style.heel_toe_roll else (0.0, sum(self.SHARES), 0.0)
+        moving = sum(self.SHARES)
+        stretch = 1.0 if style.stance_share == STANCE_SHARE else (1.0 - style.stance_share) / moving
+        shares = tuple(stretch * share for share in self.SHARES)
+        off, swing, slap = shares if style.heel_toe_roll else (0.0, sum(shares), 0.0)
         self._off, self._swing, self._slap, self._moving = off, swing, slap, off + swing + slap
         self.lift_s = (
             rest_s + np.concatenate(([0.0], np.cumsum(durations)[:-1])) if len(durations) else durations

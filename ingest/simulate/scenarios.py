@@ -132,6 +132,21 @@ def _stairs(options: Options, vary: _Vary) -> FloatArray:
     return _polyline(legs, vary)
 
 
+def _ramp(options: Options, vary: _Vary) -> FloatArray:
+    """Up a ramp, across, down a ramp beside it and back: closed."""
+    across = options.stride_m
+    length = max(across, (options.length_m or 30.0) / 2 - across)
+    climb = length * options.slope
+    turn = -np.pi / 2 if options.clockwise else np.pi / 2
+    count, side = vary.strides(length), 1
+    legs = []
+    for k in range(_laps(options, 2 * (count + side))):
+        heading = 4 * k * turn
+        legs += [(heading, length, count, climb), (heading + turn, across, side, 0.0)]
+        legs += [(heading + 2 * turn, length, count, -climb), (heading + 3 * turn, across, side, 0.0)]
+    return _polyline(legs, vary)
+
+
 def _still(options: Options, vary: _Vary) -> FloatArray:
     del vary
     return np.zeros((1, 4))
@@ -142,6 +157,7 @@ _ROUTES: dict[str, tuple[str, Callable[[Options, _Vary], FloatArray]]] = {
     "straight": ("one straight line, 20 m", _straight),
     "figure-eight": ("two touching circles, closed, 25 m a lap", _figure_eight),
     "stairs": ("a flight of stairs, up and down again", _stairs),
+    "ramp": ("up a ramp and down another, closed, 30 m a lap", _ramp),
     "still": ("a recording that never moves", _still),
 }
 

@@ -26,6 +26,7 @@ from .sensors import (
     MPU6050_1,
     MPU6050_2,
     STANDARD_GRAVITY,
+    UNKIND,
     ImuErrors,
     SimulatedImu,
 )
@@ -85,7 +86,13 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     style : Style
         How the foot moves.
     errors : str
-        ``mpu6050``: the errors of the real device where none are given; ``none``: no error at all.
+        ``mpu6050``: the errors of the real device where none are given; ``unkind``: with what wear, strap and missing
+        calibration add, and a foot that rolls as it stands; ``none``: no error at all.
+    gait : str
+        ``walk``, ``fast`` or ``run``: stride, its time and the share of it that the foot stands, where they are not
+        given.
+    slope : float
+        Ramp: rise over run.
     imu1, imu2 : ImuErrors or None
         Errors of the sensors.
     mount1, mount2 : Mount
@@ -114,7 +121,9 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     drop_share: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0
     duplicate_share: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.0
     style: Style = Style()
-    errors: Literal["mpu6050", "none"] = "mpu6050"
+    errors: Literal["mpu6050", "unkind", "none"] = "mpu6050"
+    gait: Literal["walk", "fast", "run"] = "walk"
+    slope: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = 0.08
     imu1: ImuErrors | None = None
     imu2: ImuErrors | None = None
     mount1: Mount = Mount(roll_deg=6.9, pitch_deg=24.1)
@@ -135,7 +144,20 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         return 2**acc / 16384 * STANDARD_GRAVITY, float(np.radians(1 / (131.0, 65.5, 32.8, 16.4)[gyr]))
 
     def _defaults(self, sensor: int) -> ImuErrors:
-        return IDEAL if self.errors == "none" else (MPU6050_1, MPU6050_2)[sensor - 1]
+        if self.errors == "none":
+            return IDEAL
+        device = (MPU6050_1, MPU6050_2)[sensor - 1]
+        return msgspec.structs.replace(device, **UNKIND) if self.errors == "unkind" else device
+
+
+GAITS: dict[str, dict[str, float]] = {
+    "walk": {},
+    "fast": {"stride_m": 1.75, "stride_s": 0.95, "stance_share": 0.25},
+    "run": {"stride_m": 2.3, "stride_s": 0.75, "stance_share": 0.14},
+}
+"""Strides of the gaits; a run's foot stands for a tenth of a second."""
+UNKIND_STYLE = {"stance_roll_deg": 1.0, "strike_mm": 0.5}
+"""A foot that rolls as it stands, and strikes; it rolls about the ball, real ones (Vicon) about a point farther back."""
 
 
 def make_options(scenario: str, given: dict[str, Any]) -> Options:
@@ -164,6 +186,11 @@ def make_options(scenario: str, given: dict[str, Any]) -> Options:
                 parts[imu].setdefault(name, value)
         else:
             flat[name] = value
+    for name, value in GAITS.get(str(flat.get("gait", "walk")), {}).items():
+        part = parts["style"] if name in Style.__struct_fields__ else flat
+        part.setdefault(name, value)
+    if flat.get("errors") == "unkind":
+        parts["style"] = UNKIND_STYLE | parts["style"]
     options = checked(scenario, Options, flat)
     changed: dict[str, Any] = {}
     for name, values in parts.items():
