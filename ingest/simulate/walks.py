@@ -157,7 +157,7 @@ GAITS: dict[str, dict[str, float]] = {
 }
 """Strides of the gaits; a run's foot stands for a tenth of a second."""
 UNKIND_STYLE = {"stance_roll_deg": 1.0, "strike_mm": 0.5}
-"""A foot that rolls as it stands, and strikes; it rolls about the ball, real ones (Vicon) about a point farther back."""
+"""A foot that rolls as it stands, and strikes: about the ball, real ones (Vicon) about a point farther back."""
 
 
 def make_options(scenario: str, given: dict[str, Any]) -> Options:
