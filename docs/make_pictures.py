@@ -131,8 +131,8 @@ def annotating(walk: mr.Recording, folder: Path, images: Path) -> None:
             " marcha.view.start = 4e9; marcha.view.end = 21e9;"
             " marcha.select(mine[1].id); marcha.setCursor(mine[1].end_ns); }"
         )
-        until(page, "!marcha.stage.dirty && marcha.listing")
-        until(page, "!marcha.listing")
+        first = "document.getElementById('list').tBodies[0].rows[0].cells[0].textContent"
+        until(page, f"parseFloat({first}) > 3")  # the list follows the view a little later
         image = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
         image.quantize(64, dither=Image.Dither.NONE).save(images / "page.png", optimize=True)
         print(images / "page.png")
