@@ -382,3 +382,26 @@ def test_a_page_that_does_not_know_the_newest_state_is_given_all_of_it(server: P
     assert [r["end_ns"] for r in first["added"]] == [5]
     _, second, _ = ask(server, "/api/edit", edit, **token)
     assert len(second["annotations"]) == 2
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_the_program_ends_by_ctrl_c_and_says_what_is_not_saved(path: Path) -> None:
+    code = "import sys; from marcha.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, "annotate", str(path), "--page", "--no-browser", "--in-place"]
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert program.stderr is not None
+    address = program.stderr.readline().split()[5].rstrip(";")
+    port, token = address.split(":")[2].split("/")[0], address.partition("token=")[2]
+    connection = http.client.HTTPConnection("127.0.0.1", int(port), timeout=10)
+    for name, at in (("edit", 1), ("save", 0), ("edit", 2)):
+        row = {"tier": "t", "label": "x", "start_ns": at * S, "end_ns": at * S}
+        connection.request("POST", f"/api/{name}", json.dumps({"add": [row]}), {"X-Marcha-Token": token})
+        assert connection.getresponse().read()
+    connection.close()
+    program.send_signal(signal.SIGINT)
+    out, err = program.communicate(timeout=30)
+    assert program.returncode == 0
+    assert err.startswith("marcha: 1 annotations are not saved; ")
+    assert out == f"{path}: 2 annotations, 1 not saved\n"
+    assert len(stored(path)) == 1
+    assert len(session(path).rows) == 2

@@ -85,20 +85,18 @@ def annotations_of(
         Tier of labels that have none.
     """
     side = _read_side(side_path(path))
-    known: dict[tuple[str, int, int, str], list[list[Any]]] = {}
+    known: dict[tuple[str, int, int], list[tuple[str, list[Any]]]] = {}
     tiers: dict[str, str] = {}
     if side is not None:
         for key, values in zip(side.labels, side.annotations, strict=True):
-            known.setdefault((key[0], key[1], key[2], key[3]), []).append(values)
+            known.setdefault((key[0], key[1], key[2]), []).append((key[3], values))
             tiers.setdefault(key[0] or f"[{values[0]}]", values[0])
-    for values in known.values():
-        values.reverse()
     default = tier or path.name.split(".")[0]
     rows, changed = [], 0
     for label in labels:
-        same = known.get(label[:4])
-        if same:
-            rows.append(same.pop())
+        same = _taken(known.get(label[:3], []), label.text)
+        if same is not None:
+            rows.append(same)
         elif not label.filler:
             changed += side is not None
             name, shown = (tiers.get(label.tier, label.tier) or default), label.text
@@ -118,6 +116,22 @@ def annotations_of(
             "source, confidence or note"
         )
     return table, notes
+
+
+def _taken(options: list[tuple[str, list[Any]]], text: str) -> list[Any] | None:
+    """Take out the annotation with this text; else one that differs from it in its kind of line breaks alone,
+    which tools rewrite when they save.
+    """
+    for alike in (str, _one_kind_of_breaks):
+        for place, (known, values) in enumerate(options):
+            if alike(known) == alike(text):
+                del options[place]
+                return values
+    return None
+
+
+def _one_kind_of_breaks(text: str) -> str:
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def _read_side(path: Path) -> Side | None:

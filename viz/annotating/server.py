@@ -101,7 +101,8 @@ class PageServer:
 
     def wait(self) -> None:
         """Wait until the program is interrupted."""
-        self._thread.join()
+        while self._thread.is_alive():
+            self._thread.join(0.5)  # without a limit an interrupt would wait on some systems
 
     def close(self) -> None:
         """End the server; what was not saved stays in the session's draft."""

@@ -136,7 +136,7 @@ class App {
 
   save() {
     this.say("saving …");
-    return this.marks.ask("save");
+    return this.marks.save();
   }
 
   // ----------------------------------------------------------------------------------------------- looking

@@ -57,19 +57,24 @@ export class Marks {
   }
 
   // One request after the other, in the order of the keys that were pressed.
-  ask(name, document = {}) {
-    this.queue = this.queue.then(async () => {
-      try {
-        const answer = await post(`/api/${name}`, { revision: this.revision, ...document });
-        this.take(answer);
-        this.changed(name, answer);
-        return answer;
-      } catch (error) {
-        this.failed(error);
-        return null;
-      }
-    });
+  ask(name, document) {
+    this.queue = this.queue.then(() => this.request(name, document));
     return this.queue;
+  }
+
+  // Save what was asked for so far; editing goes on meanwhile.
+  save() { return this.queue.then(() => this.request("save")); }
+
+  async request(name, document = {}) {
+    try {
+      const answer = await post(`/api/${name}`, { revision: this.revision, ...document });
+      this.take(answer);
+      this.changed(name, answer);
+      return answer;
+    } catch (error) {
+      this.failed(error);
+      return null;
+    }
   }
 
   edit(add, remove = []) { return this.ask("edit", { add, remove }); }
