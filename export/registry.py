@@ -7,10 +7,9 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from ..recording import Recording
 from ..recording.errors import UsageError
+from ..recording.options import options_of
 from ..recording.plugins import plugins
 from .contract import Exporter
 
@@ -58,7 +57,12 @@ def export(
         ``path`` exists and ``overwrite`` is false.
     """
     chosen = _exporter(to)
-    return chosen().export(rec, Path(path), _typed(chosen, options or {}), overwrite=overwrite)
+    return chosen().export(
+        rec,
+        Path(path),
+        _options(chosen, options),
+        overwrite=overwrite,
+    )
 
 
 def export_all(
@@ -86,7 +90,13 @@ def export_all(
     chosen = _exporter(to)
     together = getattr(chosen, "export_all", None)
     if together is not None:
-        return together(chosen(), recs, Path(path), _typed(chosen, options or {}), overwrite=overwrite)
+        return together(
+            chosen(),
+            recs,
+            Path(path),
+            _options(chosen, options),
+            overwrite=overwrite,
+        )
     names = [rec.path.stem + chosen.suffix for rec in recs]
     if len(set(names)) != len(names):
         raise UsageError(f"{path}: two recordings would have one name; export them one by one")
@@ -120,27 +130,8 @@ def losses(rec: Recording, to: str, *, options: Mapping[str, Any] | None = None)
     """
     chosen = _exporter(to)
     say = getattr(chosen, "losses", None)  # plug-ins of the first version do not have it
-    return say(chosen(), rec, _typed(chosen, options or {})) if say is not None else []
+    return say(chosen(), rec, _options(chosen, options)) if say is not None else []
 
 
-def _typed(exporter: type[Exporter], options: Mapping[str, Any]) -> msgspec.Struct:
-    """Return the exporter's options; text becomes the option's type, a list is separated by commas."""
-    about = msgspec.inspect.type_info(exporter.Options)
-    assert isinstance(about, msgspec.inspect.StructType)
-    kinds = {field.name: _plain(field.type) for field in about.fields}
-    values: dict[str, Any] = {}
-    for key, value in options.items():
-        if key not in kinds:
-            known = ", ".join(kinds) or "none"
-            raise UsageError(f"export option {key!r}: {exporter.name} does not have it; it has {known}")
-        if isinstance(value, str) and isinstance(kinds[key], msgspec.inspect.VarTupleType):
-            value = [part.strip() for part in value.split(",") if part.strip()]
-        values[key] = value
-    try:
-        return msgspec.convert(values, exporter.Options, strict=False)
-    except msgspec.ValidationError as error:
-        raise UsageError(f"export option of {exporter.name}: {error}") from None
-
-
-def _plain(kind: msgspec.inspect.Type) -> msgspec.inspect.Type:
-    return _plain(kind.type) if isinstance(kind, msgspec.inspect.Metadata) else kind
+def _options(exporter: type[Exporter], options: Mapping[str, Any] | None) -> Any:
+    return options_of(exporter.Options, options or {}, f"export format {exporter.name}")

@@ -14,6 +14,7 @@ import msgspec
 
 from ..recording.errors import MarchaError, UsageError
 from ..recording.files import require_regular
+from ..recording.options import options_of
 from ..recording.plugins import plugins
 from ..recording.scratch import scratch_folder
 from .archive import UNPACK_LIMIT_GB, is_zip, unpack
@@ -130,23 +131,7 @@ def make_options(importer: Importer, values: Mapping[str, Any]) -> CommonOptions
     UsageError
         An option is unknown or its value does not fit.
     """
-    known = {f.name for f in msgspec.structs.fields(importer.Options)}
-    for key in values:
-        if key not in known:
-            raise UsageError(
-                f"format {importer.name} has no option {key!r}; it has {', '.join(sorted(known))}"
-            )
-    for key, value in values.items():  # one by one, so that the message can name the option
-        try:
-            msgspec.convert({key: value}, importer.Options, strict=False)
-        except msgspec.ValidationError as error:
-            if f"$.{key}" in str(error):
-                reason = str(error).split(" - at ")[0]
-                raise UsageError(f"format {importer.name}: option {key}={value!r}: {reason}") from None
-    try:
-        return msgspec.convert(dict(values), importer.Options, strict=False)
-    except msgspec.ValidationError as error:
-        raise UsageError(f"format {importer.name}: {error}") from None
+    return options_of(importer.Options, values, f"format {importer.name}")
 
 
 def recognise(path: Path) -> list[Candidate]:

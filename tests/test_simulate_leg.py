@@ -152,7 +152,7 @@ def test_seed_and_options_decide_every_bit() -> None:
     ("scenario", "options", "said"),
     [
         ("jumping", {}, "scenario 'jumping' is unknown: choose one of walking, sit-to-stand, squats"),
-        ("walking", {"knee": 3}, "unknown option 'knee'"),
+        ("walking", {"knee": 3}, "has no option 'knee'"),
         ("walking", {"rate_hz": "0"}, "option rate_hz='0'"),
     ],
 )

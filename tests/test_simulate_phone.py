@@ -171,7 +171,7 @@ def test_every_scenario_is_finite(scenario: str) -> None:
     ("options", "said"),
     [
         ({"placement": "ear"}, "placement"),
-        ({"speed": 1}, "unknown option 'speed'"),
+        ({"speed": 1}, "has no option 'speed'"),
         ({"route": "20:up 90"}, "is no leg"),
         ({"start": "today"}, "ISO 8601"),
         ({"gnss_loss": "10"}, "gnss_loss"),

@@ -13,6 +13,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ...recording.errors import UsageError
+from ...recording.options import options_of
 from .gait import (
     FloatArray,
     GaitModel,
@@ -210,20 +211,8 @@ def checked(scenario: str, kind: type[T], values: dict[str, Any], prefix: str = 
     UsageError
         A field is unknown, or a value breaks its rule.
     """
-    known = [f.name for f in msgspec.structs.fields(kind)]
-    for name in values:
-        if name not in known:
-            more = "" if prefix else ", and the fields of style and errors (docs/formats.md)"
-            raise UsageError(
-                f"simulate {scenario}: unknown option {prefix + name!r}; there are {', '.join(known)}{more}"
-            )
-    try:
-        return msgspec.convert(values, kind, strict=False)
-    except msgspec.ValidationError as error:
-        reason, _, path = str(error).partition(" - at `$.")
-        name = path.rstrip("`")
-        value = values.get(name.split("[")[0], "")
-        raise UsageError(f"simulate {scenario}: option {prefix}{name}={value!r}: {reason}") from None
+    more = "" if prefix else ", and the fields of style and errors (docs/formats.md)"
+    return options_of(kind, values, f"simulate {scenario}", prefix=prefix, more=more)
 
 
 def plain(value: Any) -> Any:
