@@ -448,8 +448,11 @@ class MessageRunner(Runner):
 
 
 def warm_up(estimator: Any, blocks: bool) -> None:
-    """Let a kernel compile (or load from its cache) before a clock runs; its state stays as it is."""
-    if isinstance(estimator, KernelEstimator):
+    """Let a kernel compile (or load from its cache) before a clock runs; its state stays as it is.
+
+    A kernel whose state is laid out by the context alone has none yet where it has not been started.
+    """
+    if isinstance(estimator, KernelEstimator) and hasattr(estimator, "state"):
         none, width = np.empty(0, np.int64), max(len(i.columns) for i in estimator.inputs)
         values, out = np.empty((0, max(1, width))), np.empty((0, estimator.width))
         estimator.run(estimator.state, none, none, none, values, none.copy(), none.copy(), out)

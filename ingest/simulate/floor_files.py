@@ -138,7 +138,7 @@ def _facts(walk: FloorWalk) -> dict[str, Any]:
     return {
         "closed": phone.closed,
         **({"length_m": round(phone.length_m, 6)} if phone.length_m else {}),
-        "steps": phone.steps.height,
+        **({"steps": phone.steps.height} if phone.steps.height else {}),
         "scenario": phone.scenario,
         "seed": phone.seed,
         "format": "three-tables",
