@@ -37,8 +37,8 @@ def view(
     figure : Path
         Write a figure (.png or .svg) instead of opening a viewer.
     kind : str
-        Which figure: walk, signals, steps, detector, heading, fixes, transform, map, floor, radio, error, joints,
-        jumps, strides.
+        Which figure: walk, signals, steps, detector, heading, fixes, transform, map, floor, radio, radiomap,
+        ranges, powers, geometry, threshold, error, joints, jumps, strides.
     force : bool
         Replace an existing file.
     """

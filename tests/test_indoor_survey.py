@@ -205,3 +205,48 @@ def test_a_simulated_walk_becomes_a_track_on_the_plan(tmp_path):
     assert errors_["error_m"].to_numpy().mean() == pytest.approx(fused["position_error_mean_m"], abs=0.01)
     assert set(errors_["zone"]) == {"west hall", "corridor", "east hall"}
     assert abs(HELD_Z - FLOOR[0, 1]) < 1  # both lie on one floor
+
+
+def test_figures_of_a_floor_show_what_the_recording_says(tmp_path):
+    import marcha.viz as viz
+    from marcha.replay.geometry import geometry_of
+
+    made = simulate("floor-walk", tmp_path, seed=2)
+    convert(made.paths, tmp_path / "w.mcap")
+    rec = open_recording(tmp_path / "w.mcap")
+    replay(rec, ["indoor.trilateration", "indoor.pdr"], out=tmp_path / "d.mcap")
+    rec = open_recording(tmp_path / "d.mcap")
+    for kind in ("geometry", "radiomap", "ranges", "powers", "threshold"):
+        drawn = viz.figure(rec, kind=kind)
+        assert any(ax.has_data() for ax in drawn.axes), kind
+    found = geometry_of(rec)
+    known = np.isfinite(found.bound_m)
+    assert (found.extra_bound_m[known] <= found.bound_m[known] + 1e-9).all()  # another anchor never harms
+    assert np.nanmedian(found.extra_bound_m) < np.nanmedian(found.bound_m)
+    near = np.linalg.norm(FLOOR - [found.x[10], found.y[10]], axis=1) <= 10
+    assert found.heard[10, 10] == near.sum()
+
+
+def test_walkthrough_of_a_floor(tmp_path, monkeypatch):
+    """A log, an anchor table and a picture of the floor: three commands to a track with its error distribution."""
+    from PIL import Image
+
+    from .cli_helpers import marcha
+    from .conftest import ROOT
+    from .docs_blocks import blocks, commands
+
+    (folder, *_), _ = simulate("floor-walk", tmp_path, seed=3, name="walk").paths, None
+    (folder / "anchors.csv").rename(tmp_path / "beacons.csv")
+    (folder / "plan.geojson").unlink()
+    Image.new("RGB", (500, 168), "white").save(tmp_path / "floor.png")
+    monkeypatch.chdir(tmp_path)
+    first = next(b for b in blocks(ROOT / "docs" / "indoor.md", "bash") if b.runs)
+    three = commands(first.text)
+    assert len(three) == 3
+    said = ""
+    for command in three:
+        done = marcha(*command.words)
+        assert done.code == 0, f"{command.words}\n{done.out}{done.err}"
+        said += done.out
+    assert "position_error_p95_m" in said
+    assert (tmp_path / "error.png").exists()

@@ -20,6 +20,10 @@ KINDS = {
 }
 
 
+ON_A_FLOOR = ("geometry", "radiomap", "ranges", "powers", "threshold")
+"""Drawn of a simulated floor, in test_indoor_survey."""
+
+
 @pytest.fixture(scope="module")
 def recs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, mr.Recording]:
     folder = tmp_path_factory.mktemp("figures")
@@ -32,7 +36,13 @@ def recs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, mr.Recording]:
 
 def test_every_figure_is_drawn_and_has_a_line_of_help(recs: dict[str, mr.Recording]) -> None:
     known = viz.available_figures()
-    assert set(known) == {"walk", "detector", "transform", *(k for kinds in KINDS.values() for k in kinds)}
+    assert set(known) == {
+        "walk",
+        "detector",
+        "transform",
+        *(k for kinds in KINDS.values() for k in kinds),
+        *ON_A_FLOOR,
+    }
     assert all(known.values())
     for name, kinds in KINDS.items():
         for kind in kinds:

@@ -17,7 +17,7 @@ from ..recording import Recording
 from ..recording.errors import UsageError
 from ..replay.evaluate import evaluate
 from ..replay.references import shown_reference
-from . import style
+from . import indoor_figures, style
 from .canvas import PLACES, is_estimate
 from .curve import Curve
 from .floor import Anchor, floor_plan, loaders_of
@@ -393,5 +393,10 @@ FIGURES: dict[str, Callable[[Recording, Any], None]] = {
     "cycles": cycles,
     "jumps": jumps,
     "strides": strides,
+    "geometry": indoor_figures.geometry,
+    "radiomap": indoor_figures.radiomap,
+    "ranges": indoor_figures.ranges,
+    "powers": indoor_figures.powers,
+    "threshold": indoor_figures.threshold,
 }
 """Figures by name, beside ``walk``."""

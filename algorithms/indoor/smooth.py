@@ -47,17 +47,13 @@ class IndoorSmooth(PlainEstimator):
         cloud: Cloud = self.back.state
         p = self.params
         scatter(cloud, math.nan, 0.0, p.start_sd_m, math.radians(p.heading_sd_deg), p.scale_sd, p.offset_db)
-        self.kept: list[tuple[int, int, int, tuple[float, ...]]] = []
+        self.kept: list[tuple[int, int, int, tuple[Any, ...]]] = []
 
     def take(self, message: Message) -> Iterable[Result]:
         """Keep a message for the end."""
         index = next(i for i, one in enumerate(self.inputs) if one.name == message.input)
         channel = self.ahead.channel_index(index, message.channel)
-        table = pl.DataFrame(
-            {c: [v] for c, v in zip(self.inputs[index].columns, message.values, strict=True)}
-        )
-        values = tuple(self.ahead.encode(index, channel, table)[0].tolist())
-        self.kept.append((index, channel, message.t_ns, values))
+        self.kept.append((index, channel, message.t_ns, message.values))
         return ()
 
     def finish(self) -> Iterable[Result]:
@@ -68,8 +64,14 @@ class IndoorSmooth(PlainEstimator):
         channels = np.array([k[1] for k in self.kept])
         t_ns = np.array([k[2] for k in self.kept], dtype=np.int64)
         values = np.full((len(self.kept), 4), np.nan)
-        for row, (*_, given) in zip(values, self.kept, strict=True):
-            row[: len(given)] = given
+        for index, channel in sorted(set(zip(inputs.tolist(), channels.tolist(), strict=True))):
+            mine = np.flatnonzero((inputs == index) & (channels == channel))
+            given = [self.kept[k][3] for k in mine.tolist()]
+            table = pl.DataFrame(
+                given, schema=list(self.inputs[index].columns), orient="row", infer_schema_length=None
+            )
+            encoded = self.ahead.encode(index, channel, table)
+            values[mine, : encoded.shape[1]] = encoded
         self.kept = []
         order = np.argsort(t_ns, kind="stable")
         inputs, channels, t_ns, values = inputs[order], channels[order], t_ns[order], values[order]
