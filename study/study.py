@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import shutil
@@ -147,6 +148,8 @@ class StudyResult(msgspec.Struct, frozen=True):
         ]
 
 
+RENDERED = "cells/rendered"
+"""File that says of what the report was made, so that a finished study run again has nothing to do."""
 LOADED = ("marcha.ingest", "marcha.ingest.simulate")
 """Modules that every process needs beside the estimators."""
 
@@ -205,7 +208,8 @@ def run_study(
     toml = msgspec.toml.encode(_plain(config)).decode()
     with Executor(workers, scheduler) as executor:
         # First of all: the processes load what they need while this one looks for mistakes and recordings.
-        executor.warm_up(LOADED, [e.name for e in config.estimators])
+        if overwrite or not (folder / RENDERED).is_file():  # a finished study may need none
+            executor.warm_up(LOADED, [e.name for e in config.estimators])
         methods = cfg.methods(config)
         code = plan.code_digest(m.estimator for m in methods)
         plan.check_methods(methods)
@@ -240,16 +244,17 @@ def run_study(
         values = analysis.values(results, config)
         consistency = analysis.consistency(results, config)
         tables: list[pl.DataFrame] = []
-        pictures = draw(
-            executor,
-            values,
-            consistency,
-            cells,
-            config,
-            meanwhile=lambda: tables.extend(
-                [analysis.groups(values, config), analysis.comparisons(values, config)]
-            ),
-        )
+
+        def compare() -> None:
+            tables.extend([analysis.groups(values, config), analysis.comparisons(values, config)])
+
+        mark = _mark(toml, code, cells, notes)
+        pictures: list[PagePicture] | None = None
+        if _is_rendered(folder, mark):
+            compare()
+        else:
+            (folder / RENDERED).unlink(missing_ok=True)
+            pictures = draw(executor, values, consistency, cells, config, meanwhile=compare)
     groups, comparisons = tables
     by_label = labels.label_values(cells, config)
     every_pair = pairs.all_pairs(values, config)
@@ -273,7 +278,13 @@ def run_study(
         provenance=_provenance(code, started, scheduler or f"{executor.processes} processes"),
         toml=toml,
     )
-    files = _write(folder, contents, pictures)
+    if pictures is None:  # report and tables stand there, of the same cells
+        files = [
+            p for p in sorted(folder.rglob("*")) if p.is_file() and p.parent.name in (folder.name, "figures")
+        ]
+    else:
+        files = _write(folder, contents, pictures)
+        write_atomic(folder / RENDERED, lambda path: path.write_text(mark, encoding="utf-8"))
     return StudyResult(
         folder=folder,
         config=config,
@@ -285,6 +296,19 @@ def run_study(
         notes=contents.notes,
         files=files,
     )
+
+
+def _mark(toml: str, code: str, cells: Sequence[StudyCell], notes: Sequence[str]) -> str:
+    """Return a digest of everything that the report depends on."""
+    about = (toml, code, list(notes), [msgspec.to_builtins(c) for c in cells], metadata.version("marcha"))
+    return hashlib.blake2b(msgspec.msgpack.encode(about), digest_size=16).hexdigest()
+
+
+def _is_rendered(folder: Path, mark: str) -> bool:
+    """Whether the folder's report and tables were made of just this."""
+    known = folder / RENDERED
+    there = all((folder / name).is_file() for name in ("report.html", "results.parquet", "results.csv"))
+    return there and known.is_file() and known.read_text(encoding="utf-8") == mark
 
 
 def _plain(config: cfg.StudyConfig) -> Any:
