@@ -17,7 +17,19 @@ from pathlib import Path
 
 from . import Row
 
-MODULES = ("recording", "ingest", "replay", "engine", "indoor", "joint", "startup", "viz", "page", "study", "limits")
+MODULES = (
+    "recording",
+    "ingest",
+    "replay",
+    "engine",
+    "indoor",
+    "joint",
+    "startup",
+    "viz",
+    "page",
+    "study",
+    "limits",
+)
 
 
 def _number(value: float | None) -> str:
