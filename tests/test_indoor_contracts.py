@@ -122,5 +122,15 @@ class TestZones(IndoorContract):
         return {"position": {"/p": position}, "sigma": {"/s": sigma}}
 
 
+class TestFloors(IndoorContract):
+    name = "indoor.floors"
+
+    def tables(self) -> Tables:
+        t = np.arange(400) * 200_000_000
+        height = np.interp(t / 1e9, [0, 30, 45, 80], [0, 0, 6.8, 6.8])
+        pressure = 101_325 * np.exp(-height / 8434.5) + np.random.default_rng(1).standard_normal(400)
+        return {"pressure": {"/phone/pressure": pl.DataFrame({"t_ns": t, "pressure_pa": pressure})}}
+
+
 def test_the_samples_are_of_known_anchors():
     assert set(heard(walk(12), 1.0)["mac"]) == set(MACS)

@@ -13,6 +13,7 @@ from marcha.algorithms.indoor.places import coverage
 from marcha.ingest import convert
 from marcha.ingest.simulate import FLOOR_SCENARIOS, floor_walk, simulate
 from marcha.ingest.simulate.floor import ANCHORS, HELD_Z, shadowing
+from marcha.recording import MarchaError
 from marcha.recording import open as open_recording
 from marcha.replay import evaluate, replay
 from marcha.replay.evaluate import recording_view
@@ -148,6 +149,64 @@ def test_zones_have_probabilities_and_do_not_flicker():
     assert found["stay"]["zone"].to_list() == [0.0, 1.0]  # once in the west, once in the east
     with pytest.raises(AlgorithmError, match="names no zone"):
         drive(make("indoor.zones"), tables)
+
+
+def test_floors_change_with_stairs_and_not_with_the_weather():
+    t = np.arange(0, 1200, 0.2)
+    height = np.interp(t, [0, 300, 320, 600, 640, 1200], [0, 0, 3.4, 3.4, 10.2, 10.2])
+    weather = 30.0 * np.sin(2 * np.pi * t / 7200)  # at first 1 hPa an hour, which is 8 m of height
+    noise = 1.5 * np.random.default_rng(2).standard_normal(len(t))
+    pressure = 101_325 * np.exp(-height / 8434.5) + weather + noise
+    table_ = pl.DataFrame({"t_ns": (t * 1e9).astype(np.int64), "pressure_pa": pressure})
+    found = drive(make("indoor.floors"), {"pressure": {"/phone/pressure": table_}})
+    assert found["change"]["to"].to_list() == [1.0, 2.0, 3.0]
+    at = found["change"]["t_ns"].to_numpy() / 1e9
+    assert (at > [300, 600, 620]).all()
+    assert (at < [330, 630, 650]).all()
+
+
+def test_a_radio_map_is_judged_on_the_path_that_it_does_not_know(tmp_path):
+    from marcha.replay.leave_out import leave_one_out
+
+    recs = []
+    for seed in (1, 2, 3):
+        made = simulate("floor-walk", tmp_path, seed=seed, shadow_db=1.0, rest_s=2.0)
+        convert(made.paths, tmp_path / f"{seed}.mcap")
+        recs.append(open_recording(tmp_path / f"{seed}.mcap"))
+    runs = leave_one_out(recs, ["indoor.fingerprint[window_s=2]"], params={"cell_m": 1.0})
+    assert len(runs) == 3
+    assert np.mean([r[0].metrics["position_error_mean_m"] for r in runs.values()]) < 3.5
+    with pytest.raises(MarchaError, match="two recordings"):
+        leave_one_out(recs[:1], ["indoor.fingerprint"])
+
+
+@pytest.mark.data
+def test_walls_of_the_shops_help_dead_reckoning_on_both_paths(data_dir, tmp_path):
+    """Steps from the first waypoint, shops closed; the hybrid without anchors says what to run instead."""
+    folder = data_dir / "indoor" / "android_paths"
+    free_m, wall_m = [], []
+    for name, (x, y) in (
+        ("5dd9efa99191710006b57090", (143.9522, 85.64752)),
+        ("5dda0221c5b77e0006b17410", (84.03667, 139.25401)),
+    ):
+        inputs = [folder / f"{name}.txt", folder / "geojson_map.json", folder / "floor_info.json"]
+        convert(inputs, tmp_path / f"{name}.mcap", options={"plan.rooms": "obstacle"})
+        rec = open_recording(tmp_path / f"{name}.mcap")
+        with pytest.raises(MarchaError, match=r"anchors\.csv.*phone\.pdr"):
+            replay(rec, ["indoor.hybrid"])
+        start = f"preset=walls,start_x={x},start_y={y}"
+        runs = replay(
+            rec, [f"indoor.fused[{start}]", f"indoor.fused[{start},walls=false]"], metrics=False
+        ).runs
+        points = rec.table("/reference/position")[1:]
+        for run, into in zip(runs, (wall_m, free_m), strict=True):
+            track = run.tables["position"]
+            at = [np.interp(points["t_ns"], track["t_ns"], track[c]) for c in ("pos_x", "pos_y")]
+            into.append(
+                np.hypot(at[0] - points["pos_x"].to_numpy(), at[1] - points["pos_y"].to_numpy()).mean()
+            )
+    assert all(w <= f for w, f in zip(wall_m, free_m, strict=True)), (wall_m, free_m)
+    assert np.mean(wall_m) < 0.95 * np.mean(free_m)
 
 
 def test_shadowing_is_a_field_of_unit_variance_and_exponential_correlation():
