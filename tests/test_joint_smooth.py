@@ -13,6 +13,7 @@ from marcha.algorithms.joint.smooth import smooth
 from marcha.ingest import convert
 from marcha.ingest.simulate import simulate
 from marcha.replay import Run, replay
+from marcha.study.config import load
 
 
 @pytest.fixture(scope="module")
@@ -97,3 +98,16 @@ def test_smoother_is_the_least_squares_solution() -> None:
     np.testing.assert_allclose(out[:, 0], expected[::2], atol=1e-9)
     variance = np.diag(np.linalg.inv(design.T @ design))[::2]
     np.testing.assert_allclose(out[:, 1], variance, rtol=1e-6)
+
+
+def test_study_of_the_source_states_its_tables() -> None:
+    """Means of tables 6 and 7 as printed: 2.1156 and 1.6164 of RMSE, .9941 and .9951 of r."""
+    config, _ = load("joint-tables")
+    for kind, means in (
+        ("RMSE", {"SMe": 2.1156, "SMeA": 1.6164}),
+        ("Pearson r", {"SMe": 0.9941, "SMeA": 0.9951}),
+    ):
+        tables = [t for t in config.published if t.metric.startswith(f"{kind}, roll")]
+        assert len(tables) == 2
+        for name, mean in means.items():
+            assert np.mean([t.rows[name]["exoskeleton"] for t in tables]) == pytest.approx(mean, abs=6e-5)
