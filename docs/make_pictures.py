@@ -108,6 +108,7 @@ def annotating(walk: mr.Recording, folder: Path, images: Path) -> None:
     """Take the pictures of the annotating page and of the viewer while marking."""
     sys.path.insert(0, str(Path(__file__).parents[1]))
     import rerun as rr
+    from marcha.viz.annotating import Session
     from marcha.viz.annotating.server import PageServer
     from marcha.viz.draw import draw
     from marcha.viz.stream import finish, new_stream
@@ -121,7 +122,7 @@ def annotating(walk: mr.Recording, folder: Path, images: Path) -> None:
     finish(stream)
     for picture in screenshots(folder / "annotate.rrd", ["Overview"], at=0.62):
         save(picture, images / "viewer-annotate.png")
-    session = viz.annotating.Session(walk, walk.path, by="eva", overwrite=True, action="page")
+    session = Session(walk, walk.path, by="eva", overwrite=True, action="page")
     with chromium() as browser, PageServer(session) as server:
         page = opened(browser, server.address, (1400, 800))
         page.locator("#label").fill("bad stretch")

@@ -58,7 +58,7 @@ class Signals:
         }
         self._workers = helpers("pyramid", most=2)
         self._ended = threading.Event()
-        self._tasks = [self._workers.submit(self._build, p) for p in self.pyramids.values()]
+        self._tasks = {t: self._workers.submit(self._build, p) for t, p in self.pyramids.items()}
 
     def _build(self, pyramid: Pyramid) -> None:
         if not self._ended.is_set():
@@ -72,9 +72,9 @@ class Signals:
     def overview(self, topic: str) -> tuple[dict[str, Any], Tile]:
         """Return what is known of a channel and its coarsest level; raises what reading it raised."""
         pyramid = self.pyramids[topic]
-        for task in self._tasks:
-            if task.done() and (error := task.exception()) is not None:
-                raise error
+        task = self._tasks[topic]
+        if task.done():
+            task.result()
         complete = pyramid.complete  # before the tile: a channel may be read to its end meanwhile
         tile = pyramid.overview()
         about = {

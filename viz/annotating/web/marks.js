@@ -26,6 +26,7 @@ export class Marks {
       touched.add(row.tier);
       this.rows.set(row.id, row);
     }
+    this.order = null;
     this.layOut(touched);
     Object.assign(this, { revision: answer.revision, unsaved: answer.unsaved, canUndo: answer.can_undo, canRedo: answer.can_redo });
   }
@@ -88,6 +89,24 @@ export class Marks {
 
   // In the order of time.
   sorted() {
-    return [...this.rows.values()].sort((a, b) => a.start_ns - b.start_ns || a.end_ns - b.end_ns || (a.id < b.id ? -1 : 1));
+    this.order ??= [...this.rows.values()].sort(byTime);
+    return this.order;
+  }
+
+  // Those that touch a range of time: the first so many of each lane, in the order of time, and how many there are.
+  seen(start, end, most, hidden) {
+    let count = 0;
+    const found = [];
+    for (const [tier, levels] of this.tiers) {
+      if (hidden.has(tier)) continue;
+      for (const level of levels) {
+        const [from, to] = Marks.within(level, start, end);
+        count += Math.max(to - from, 0);
+        for (let i = from; i < Math.min(to, from + most); i++) found.push(this.rows.get(level.ids[i]));
+      }
+    }
+    return { rows: found.sort(byTime).slice(0, most), count };
   }
 }
+
+const byTime = (a, b) => a.start_ns - b.start_ns || a.end_ns - b.end_ns || (a.id < b.id ? -1 : 1);

@@ -57,9 +57,9 @@ const option = (value) => Object.assign(document.createElement("option"), { valu
 
 export function listAnnotations(app) {
   const { view, marks, selected, hidden } = app;
-  const inView = marks.sorted().filter((r) => r.start_ns <= view.end && r.end_ns >= view.start && !hidden.has(r.tier));
-  byId("count").textContent = inView.length > MOST ? `(first ${MOST} of ${inView.length})` : `(${inView.length})`;
-  byId("list").tBodies[0].replaceChildren(...inView.slice(0, MOST).map((row) => {
+  const { rows, count } = marks.seen(view.start, view.end, MOST, hidden);
+  byId("count").textContent = count > MOST ? `(first ${MOST} of ${count})` : `(${count})`;
+  byId("list").tBodies[0].replaceChildren(...rows.map((row) => {
     const line = document.createElement("tr");
     line.className = row.id === selected ? "on" : "";
     for (const text of [seconds(row.start_ns), seconds(row.end_ns - row.start_ns), lastPart(row.tier), row.label]) {

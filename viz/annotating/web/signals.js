@@ -1,7 +1,7 @@
 // Channels as smallest and largest values over blocks, coarse to fine. What is seen is asked for; until it is
 // there, the next coarser level is drawn in its place.
 
-import { getBytes, token } from "./api.js";
+import { getBytes } from "./api.js";
 
 const MOST_TILES = 96; // a channel
 
@@ -132,5 +132,3 @@ function usual(top, rows) {
   const each = Array.from(top.first, (t, i) => (top.last[i] - t) / (rows - 1)).filter((d) => d > 0).sort((a, b) => a - b);
   return each.length ? each[each.length >> 1] : 1e9;
 }
-
-export { token };
