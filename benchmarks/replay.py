@@ -13,6 +13,7 @@ from typing import Any
 import marcha.recording as mr
 import numpy as np
 import polars as pl
+from marcha.algorithms import make
 from marcha.ingest.simulate import walk
 from marcha.replay import replay
 
@@ -54,7 +55,10 @@ def rows(scale: float) -> list[Row]:
         growth = _peak_mb(large) - _peak_mb(small)
     numpy_loop, library = "9-state filter in plain NumPy, no files", "vqf (C++), orientation only, no files"
     ratio = IN_BLOCKS / VQF_WHERE_PROMISED
+    fixed, adaptive = _kernel(readings, detector="c1c2c3"), _kernel(readings)
     return [
+        Row("foot.9iez, adaptive detector, kernel alone", adaptive * 1e6, "µs/sample", "detector c1c2c3",
+            fixed * 1e6, adaptive / fixed, "≤ 1.3 × c1c2c3", adaptive <= 1.3 * fixed),
         _rate("replay per sample, results in memory", single, numpy_loop, plain, PER_SAMPLE),
         _rate("replay per sample, all six outputs recorded", written, numpy_loop, plain, PER_SAMPLE),
         Row("replay in blocks, results in memory, with metrics", kept, "samples/s", library, vqf, kept / vqf,
@@ -68,6 +72,13 @@ def rows(scale: float) -> list[Row]:
             f"< {MEMORY_MB} MB", growth < MEMORY_MB,
         ),
     ]  # fmt: skip
+
+
+def _kernel(readings: np.ndarray, **params: Any) -> float:
+    """Return seconds a sample of the filter's compiled loop, without the engine."""
+    rows = np.column_stack([np.full(len(readings), 0.01), readings])
+    out = np.empty((len(rows), make("foot.9iez", **params).width))  # type: ignore[attr-defined]
+    return _best(lambda: make("foot.9iez", **params).run_block(rows, out)) / len(rows)  # type: ignore[attr-defined]
 
 
 def _rate(name: str, ours: float, peer: str, theirs: float, target: float) -> Row:

@@ -176,6 +176,25 @@ def test_madgwick_equals_the_published_matrices() -> None:
     np.testing.assert_allclose(s, q, rtol=0, atol=1e-12)
 
 
+def test_mahony_equals_a_library() -> None:
+    mahony = pytest.importorskip("ahrs").filters.Mahony
+    rng = np.random.default_rng(0)
+    peer = mahony(frequency=100.0, k_P=0.7, k_I=0.2, b0=np.zeros(3))
+    q, s, correction = np.array([1.0, 0, 0, 0]), np.array([1.0, 0, 0, 0]), np.zeros(3)
+    force = rng.normal(size=(3000, 3)) + np.array([0, 0, 9.81])
+    for f, w in zip(force, rng.normal(size=(3000, 3)), strict=True):
+        q = peer.updateIMU(q, gyr=w, acc=f, dt=0.01)
+        foot_9iez_mad.mahony(s, correction, f[0], f[1], f[2], w[0], w[1], w[2], 0.01, 0.7, 0.2)
+    np.testing.assert_allclose(s, q, rtol=0, atol=1e-9)
+
+
+def test_mahony_follows_a_walk_as_madgwick_does() -> None:
+    rows, walk = simulated()
+    result, _ = run("foot.9iez-mad", rows, orientation="mahony")
+    pos = columns(result, "pose", "pos_x", "pos_y", "pos_z")
+    assert np.linalg.norm(pos[-1] - (walk.pos - walk.pos[0])[-1]) < 0.3
+
+
 def test_madgwick_finds_down_from_a_wrong_start() -> None:
     s = np.array([np.cos(0.4), np.sin(0.4), 0, 0])
     for _ in range(20_000):

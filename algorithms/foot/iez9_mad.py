@@ -1,9 +1,11 @@
-"""Nine-state zero-velocity filter whose orientation comes from Madgwick's gradient filter ("9IEZ+MAD")."""
+"""Nine-state zero-velocity filter whose orientation comes from a complementary filter: Madgwick's ("9IEZ+MAD") or
+Mahony's.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 from ..contract import FloatArray
 from ..numerics import strapdown
@@ -20,6 +22,10 @@ RECORD = record_type(
     *base.FILTER,
     ("zupt_turns", "?"),
     ("beta", "f8"),
+    ("is_mahony", "?"),
+    ("gain_p", "f8"),
+    ("gain_i", "f8"),
+    ("correction", "f8", (3,)),  # Mahony's integral: minus the gyroscope bias as it sees it, rad/s
     ("quat", "f8", (4,)),  # wxyz, rot_nb
     *core.CORE,
 )
@@ -37,6 +43,28 @@ class Foot9IezMadParams(base.Foot9IezParams, frozen=True, forbid_unknown_fields=
             ge=0.0,
         ),
     ] = 0.033
+    orientation: Annotated[
+        Literal["madgwick", "mahony"],
+        meta("Which filter gives the orientation", source="Madgwick 2010; Mahony et al. 2008"),
+    ] = "madgwick"
+    mahony_p: Annotated[
+        float,
+        meta(
+            "Mahony: proportional gain, trust in the accelerometer",
+            "rad/s",
+            "ahrs: 1.0; ours: a walk's",
+            ge=0.0,
+        ),
+    ] = 0.1
+    mahony_i: Annotated[
+        float,
+        meta(
+            "Mahony: integral gain, how fast the bias follows",
+            "rad/s²",
+            "ours: the rest has the bias",
+            ge=0.0,
+        ),
+    ] = 0.0
     zupt_turns: Annotated[
         bool,
         meta(
@@ -97,11 +125,54 @@ def madgwick(
 
 
 @inlined
+def mahony(
+    q: FloatArray,
+    correction: FloatArray,
+    ax: float,
+    ay: float,
+    az: float,
+    wx: float,
+    wy: float,
+    wz: float,
+    dt: float,
+    gain_p: float,
+    gain_i: float,
+) -> None:
+    """Carry the quaternion (wxyz, rot_nb) ``q`` over ``dt``: Mahony, Hamel, Pflimlin 2008, eqs 32 and 48.
+
+    ``a`` is the specific force in any unit, ``w`` the angular rate in rad/s; ``correction`` collects the integral
+    term. A force of norm zero is left out.
+    """
+    a, b, c, d = q[0], q[1], q[2], q[3]
+    norm = math.sqrt(ax * ax + ay * ay + az * az)
+    if norm > 0.0:
+        # Upwards as the quaternion has it, in b; the cross product turns it towards the measured one.
+        ux, uy, uz = 2.0 * (b * d - a * c), 2.0 * (a * b + c * d), a * a - b * b - c * c + d * d
+        ex, ey, ez = (ay * uz - az * uy) / norm, (az * ux - ax * uz) / norm, (ax * uy - ay * ux) / norm
+        correction[0] += gain_i * ex * dt
+        correction[1] += gain_i * ey * dt
+        correction[2] += gain_i * ez * dt
+        wx += correction[0] + gain_p * ex
+        wy += correction[1] + gain_p * ey
+        wz += correction[2] + gain_p * ez
+    q[0] = a + 0.5 * dt * (-b * wx - c * wy - d * wz)
+    q[1] = b + 0.5 * dt * (a * wx + c * wz - d * wy)
+    q[2] = c + 0.5 * dt * (a * wy - b * wz + d * wx)
+    q[3] = d + 0.5 * dt * (a * wz + b * wy - c * wx)
+    norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    for i in range(4):
+        q[i] /= norm
+
+
+@inlined
 def _advance(s: Any, r: Any) -> None:
     strapdown.resolve(s, r)
     x, y, z = s.force[0], s.force[1], s.force[2]
     wx, wy, wz = r.gyr[0] - s.bias_gyr[0], r.gyr[1] - s.bias_gyr[1], r.gyr[2] - s.bias_gyr[2]
-    madgwick(s.quat, r.acc[0], r.acc[1], r.acc[2], wx, wy, wz, r.dt, s.beta)
+    if s.is_mahony:
+        mahony(s.quat, s.correction, r.acc[0], r.acc[1], r.acc[2], wx, wy, wz, r.dt, s.gain_p, s.gain_i)
+    else:
+        madgwick(s.quat, r.acc[0], r.acc[1], r.acc[2], wx, wy, wz, r.dt, s.beta)
     set_quat(s.rot, s.quat[0], s.quat[1], s.quat[2], s.quat[3])
     strapdown.resolve(s, r)
     strapdown.average_force(s, x, y, z)
@@ -167,7 +238,8 @@ def flush(state: Any, ring: Any, out: FloatArray) -> int:
 
 
 class Foot9IezMad(FootEstimator):
-    """Position and velocity of the nine-state filter, orientation of Madgwick's gradient filter for IMU.
+    """Position and velocity of the nine-state filter, orientation of Madgwick's gradient filter for IMU, or of
+    Mahony's complementary filter beside it (``orientation``).
 
     Source: foot-navigation dissertation, eq 3.18 and section 3.6; Madgwick (2010), "An efficient orientation
     filter for inertial and inertial/magnetic sensor arrays". The initial orientation and the gyroscope bias
@@ -192,3 +264,5 @@ class Foot9IezMad(FootEstimator):
         """Write the noise variances and the gain into the state."""
         base.configure(record, params)
         record.zupt_turns, record.beta = params.zupt_turns, params.beta
+        record.is_mahony = params.orientation == "mahony"
+        record.gain_p, record.gain_i = params.mahony_p, params.mahony_i
