@@ -40,6 +40,7 @@ def test_every_figure_is_drawn_and_has_a_line_of_help(recs: dict[str, mr.Recordi
         "walk",
         "detector",
         "transform",
+        "conditions",
         *(k for kinds in KINDS.values() for k in kinds),
         *ON_A_FLOOR,
     }

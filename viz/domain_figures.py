@@ -23,6 +23,7 @@ from .curve import Curve
 from .floor import Anchor, floor_plan, loaders_of
 from .phone_figures import detector, street_map, transform
 from .shapes import ELLIPSE95, circle, geo_circle, metres_a_degree
+from .stance_figures import conditions
 from .stride_figures import strides
 from .text import printable
 from .trace import Trace, compared, distance
@@ -398,5 +399,6 @@ FIGURES: dict[str, Callable[[Recording, Any], None]] = {
     "ranges": indoor_figures.ranges,
     "powers": indoor_figures.powers,
     "threshold": indoor_figures.threshold,
+    "conditions": conditions,
 }
 """Figures by name, beside ``walk``."""

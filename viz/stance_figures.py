@@ -1,0 +1,149 @@
+"""How a stance detector decides: its conditions over the signals, each as 0 or 1, their AND, the cleaned result."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from ..recording import Recording
+from ..recording.errors import UsageError
+from . import style
+from .canvas import is_estimate
+from .text import printable
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+NAMED, STANCE = "marcha_msgs/msg/NamedValues", "marcha_msgs/msg/Stance"
+SHOWN_S = 8.0
+"""s that are shown, from a second before the first swing on: more strides cannot be told apart on paper."""
+UNITS = {
+    "acc_norm": "m/s²",
+    "acc_var": "m²/s⁴",
+    "gyr_norm": "rad/s",
+    "pitch_dev": "deg",
+    "pitch_var": "deg²",
+    "are": "rad²/s²",
+    "mv": "m²/s⁴",
+    "mag": "m²/s⁴",
+}
+Bools = NDArray[np.bool_]
+
+
+def conditions(rec: Recording, fig: Figure) -> None:
+    """Conditions of each stance detector over its signals, each as 0 or 1, their AND, the cleaned result."""
+    runs = {}
+    for topic, channel in rec.channels.items():
+        stance = topic.rpartition("/")[0] + "/stance"
+        if (
+            is_estimate(topic)
+            and channel.schema == NAMED
+            and "detector" in channel.metadata
+            and channel.count
+            and stance in rec.channels
+        ):
+            runs.setdefault(channel.metadata["detector"], (topic, stance))
+    if not runs:
+        raise UsageError(
+            f"{rec.path}: nothing for this figure: no stance detector; replay a foot estimator first"
+        )
+    tables = {name: (rec.table(values), rec.table(stance)) for name, (values, stance) in runs.items()}
+    heights = [h for values, _ in tables.values() for h in [*([1.0] * len(_statistics(values))), 1.5]]
+    fig.set_size_inches(10.0, 1.0 + 1.7 * sum(heights))
+    panels = iter(fig.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0])
+    for name, (values, stance) in tables.items():
+        topic = runs[name][0]
+        _detector(
+            panels, name, printable(topic.split("/")[2]), values, stance, rec.channels[topic].metadata, rec
+        )
+
+
+def _statistics(values: pl.DataFrame) -> list[str]:
+    return [c for c in values.columns if c not in ("t_ns", "threshold", "still")]
+
+
+def _detector(
+    panels: Any,
+    name: str,
+    run: str,
+    values: pl.DataFrame,
+    stance: pl.DataFrame,
+    metadata: dict[str, str],
+    rec: Recording,
+) -> None:
+    both = values.join(stance.select("t_ns", "still"), on="t_ns", how="inner").sort("t_ns")
+    t = (both["t_ns"].to_numpy() - (rec.start_ns or 0)) / 1e9
+    still = both["still"].cast(pl.Boolean).to_numpy()
+    moving = np.flatnonzero(~still & (np.arange(len(t)) > np.argmax(still)))
+    begin = t[moving[0]] - 1.0 if moving.size else t[0]
+    shown = (t >= begin) & (t <= begin + SHOWN_S)
+    t, still, both = t[shown], still[shown], both.filter(pl.Series(shown))
+    lanes: list[tuple[str, Bools]] = []
+    for statistic in _statistics(both):
+        ax = next(panels)
+        x = both[statistic].to_numpy()
+        met = np.ones(len(x), bool)
+        ax.plot(t, x, color=style.NORM, linewidth=0.9, label=statistic)
+        low, high = (_number(metadata, f"threshold.{statistic}{end}") for end in (".min", ""))
+        if "threshold" in both.columns:
+            limit = both["threshold"].to_numpy()
+            ax.plot(
+                t,
+                limit,
+                color=style.AXES[0],
+                linewidth=0.9,
+                linestyle="--",
+                label="threshold, follows the gait",
+            )
+            met = x < limit
+            ax.set_yscale("log")
+        for limit, label, keep in ((low, "above", x > (low or 0.0)), (high, "below", x < (high or 0.0))):
+            if limit is not None:
+                ax.axhline(
+                    limit,
+                    color=style.AXES[0],
+                    linewidth=0.9,
+                    linestyle="--",
+                    label=f"still {label} {limit:g}",
+                )
+                met &= keep
+        if high is not None and "threshold" not in both.columns:
+            ax.set_ylim(min(0.0, float(np.nanmin(x))), max(4.0 * high if low is None else 2.5 * high, 1e-9))
+        _boxes(ax, t, still)
+        _dress(ax, f"{run}: {statistic} (detector {name}); grey: stance", UNITS.get(statistic, ""))
+        lanes.append((statistic, met))
+    every = np.logical_and.reduce([met for _, met in lanes])
+    lanes += [("all of them", every)] if len(lanes) > 1 else []
+    lanes.append(("cleaned: still", still))
+    ax = next(panels)
+    for k, (label, met) in enumerate(reversed(lanes)):
+        colour = style.run_color(0) if label.startswith("cleaned") else style.NORM
+        ax.fill_between(t, k, k + 0.75 * met, step="mid", color=colour, linewidth=0)
+    ax.set_yticks([k + 0.4 for k in range(len(lanes))], [label for label, _ in reversed(lanes)], fontsize=8)
+    ax.set_ylim(-0.2, len(lanes))
+    _dress(ax, f"{run}: each condition as 0 or 1, and what came of them", "", legend=False)
+    ax.set_xlabel("time since the start (s)", fontsize=9)
+
+
+def _number(metadata: dict[str, str], key: str) -> float | None:
+    return float(metadata[key]) if key in metadata else None
+
+
+def _boxes(ax: Axes, t: NDArray[np.float64], still: Bools) -> None:
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
+    for a, b in zip(edges[::2], edges[1::2], strict=True):
+        ax.axvspan(t[a], t[min(b, len(t) - 1)], color="#000000", alpha=0.08, linewidth=0)
+
+
+def _dress(ax: Axes, title: str, unit: str, *, legend: bool = True) -> None:
+    ax.set_title(title, fontsize=10, loc="left")
+    ax.set_ylabel(unit, fontsize=9)
+    ax.tick_params(labelsize=8)
+    ax.grid(color="#DDDDDD", linewidth=0.6)
+    ax.set_axisbelow(True)
+    if legend:
+        ax.legend(fontsize=8, loc="upper right")
