@@ -28,6 +28,8 @@ class App {
     this.channels = new Map();
     this.panels = recording.panels;
     this.marks = new Marks(recording, (name, answer) => this.changed(name, answer), (e) => this.failed(e));
+    // tiers of people before those of runs: there are fewer colours than tiers may be
+    for (const tier of [...this.marks.tiers.keys()].sort((a, b) => a.includes("/") - b.includes("/"))) this.colorOf(tier);
     const places = new Map();
     for (const panel of this.panels) {
       const place = places.get(panel.topic) ?? 0;

@@ -40,7 +40,7 @@ export function listTiers(app) {
   if (key !== listTiers.key) {
     listTiers.key = key;
     byId("lanes").replaceChildren(...tiers.filter((t) => app.marks.tiers.has(t)).map((tier) =>
-      checkbox(tier, !app.hidden.has(tier), app.colorOf(tier), (shown) => {
+      checkbox(runLast(tier), !app.hidden.has(tier), app.colorOf(tier), (shown) => {
         if (shown) app.hidden.delete(tier);
         else app.hidden.add(tier);
         app.stage.dirty = true;
@@ -52,6 +52,9 @@ export function listTiers(app) {
 
 // Of a tier like run/stance what tells it from the others of its run.
 export const lastPart = (tier) => tier.slice(tier.lastIndexOf("/") + 1);
+
+// The same in front of its run: the end of long names is cut.
+const runLast = (tier) => (tier.includes("/") ? `${lastPart(tier)} · ${tier.slice(0, tier.lastIndexOf("/"))}` : tier);
 
 const option = (value) => Object.assign(document.createElement("option"), { value });
 
