@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import os
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -19,6 +21,12 @@ def threads() -> int:
     given = os.environ.get(LIMIT, "")
     most = int(given) if given.isdigit() and int(given) > 0 else 4
     return min(4, most, os.cpu_count() or 1)
+
+
+def give_back_memory() -> None:
+    """Hand freed memory to the system where the C library keeps it: a thread's share of it may be large."""
+    with contextlib.suppress(AttributeError, OSError, ValueError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)  # glibc has it, others give back by themselves
 
 
 def helpers(name: str, most: int = 4) -> Executor:

@@ -13,6 +13,7 @@ from ..recording import Recording
 from ..recording import open as open_recording
 from ..recording.errors import OutputExists, UsageError
 from ..recording.provenance import hash_file
+from ..recording.threads import give_back_memory
 from .clock import Clock
 from .engine import Engine, Progress
 from .evaluate import evaluate, evaluate_run, recording_view, truth_of
@@ -172,6 +173,10 @@ def replay(
     if failure is not None:
         raise failure
     if target is not None and tables is None and metrics:
+        del engine  # its buffers and what is in the file make room for the tracks
+        for run in result.runs:
+            run.annotations = run.annotations.clear()
+        give_back_memory()
         with open_recording(target) as written:
             found = evaluate(written, runs=[r.run for r in result.runs], intervals=False, survey=survey)
         evaluated = {r.run: r for r in found.runs}

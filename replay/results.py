@@ -44,7 +44,7 @@ class Run:
     tables : dict of str to polars.DataFrame
         Results by output (``t_ns``, ``t_log_ns``, columns); empty where they were not kept.
     annotations : polars.DataFrame
-        Stances and steps.
+        Stances and steps; empty where tables were not kept and a file has them.
     lineage : dict of str to str
         What the recording's metadata record ``run/<id>`` says.
     """
