@@ -129,12 +129,12 @@ def check(path: Path, /, *, common: Common = DEFAULT) -> Outcome:
     found = [finding_entry(f) for f in examine(rec)]
     imported, lossy = import_report(rec)
     if not found and not imported:
-        said = "nothing is wrong"
+        verdict = "nothing is wrong"
     else:
-        said = "look at this" if found else "the recording is sound; the raw log was not"
+        verdict = "look at this" if found else "the recording is sound; the raw log was not"
         if not found and not lossy:
-            said = "nothing is wrong; the import made remarks"
-    lines: list[Heading | TextTable] = [Heading(f"{path}: {said}")]
+            verdict = "nothing is wrong; the import made remarks"
+    lines: list[Heading | TextTable] = [Heading(f"{path}: {verdict}")]
     if found:
         lines.append(finding_table(found))
     if imported:

@@ -144,16 +144,16 @@ def _each(paths: tuple[Path, ...], folder: Path, options: dict[str, Any], common
         codes = []
         for log in batch.logs:
             try:
-                document, said, code = _one([log], folder / names[log], options, common)
+                document, shown, code = _one([log], folder / names[log], options, common)
             except Exception as error:
                 known = expected(error)
                 if known is None:
                     raise
                 line, code = batch.shown(known[0]), known[1]
                 complain(line)
-                document, said = {"output": None, "error": line, "exit_code": code}, []
+                document, shown = {"output": None, "error": line, "exit_code": code}, []
             conversions.append({"input": batch.shown(log), **document})
-            lines += said
+            lines += shown
             codes.append(code)
     taken = {path for made in conversions for path in made.get("also_read", ())}
     skipped = [(batch.shown(path), reason) for path, reason in batch.skipped if str(path) not in taken]
@@ -170,12 +170,12 @@ def _each(paths: tuple[Path, ...], folder: Path, options: dict[str, Any], common
 
 def _summary(done: int, logs: int, folder: Path, skipped: list[tuple[str, str]]) -> str:
     """Return what became of the files: converted, failed, and skipped ones by name."""
-    said = f"{done} of {logs} logs converted to {folder}"
+    summary = f"{done} of {logs} logs converted to {folder}"
     if done < logs:
-        said += f"; {logs - done} failed"
+        summary += f"; {logs - done} failed"
     if skipped:
-        said += f"; {len(skipped)} other files skipped:"
-    return "\n".join([said, *(f"  {path}: {reason}" for path, reason in skipped)])
+        summary += f"; {len(skipped)} other files skipped:"
+    return "\n".join([summary, *(f"  {path}: {reason}" for path, reason in skipped)])
 
 
 def _names(logs: list[Path]) -> dict[Path, str]:

@@ -253,6 +253,6 @@ def _write(
                     written.add_metadata(name, clocks)
             elif name != "alignment":
                 written.add_metadata(name, dict(record))
-        said = {k: v if isinstance(v, str) else f"{v:.9g}" for k, v in msgspec.to_builtins(fit).items()}
+        fitted = {k: v if isinstance(v, str) else f"{v:.9g}" for k, v in msgspec.to_builtins(fit).items()}
         facts = {"moved": ", ".join(sorted(moved)), "segment": segments, "all_later_s": f"{later * 1e-9:.9g}"}
-        written.add_metadata("alignment", {**facts, **said})
+        written.add_metadata("alignment", {**facts, **fitted})

@@ -32,10 +32,10 @@ class LogsFound(NamedTuple):
 
     def shown(self, text: object) -> str:
         """Return a path, or a message that names one, as the user knows it: inside its archive."""
-        said = str(text)
+        line = str(text)
         for folder, archive in self.archives.items():
-            said = said.replace(str(folder), str(archive))
-        return said
+            line = line.replace(str(folder), str(archive))
+        return line
 
 
 def logs(

@@ -130,8 +130,8 @@ def convert(
             sources, format, stack, mapped=mapped, unpack_limit_gb=unpack_limit(options or {})
         )
         settings = registry.share_options(found, chosen)
-        told = ReportBuilder()
-        floor = read_floor(beside, place, told)
+        floor_report = ReportBuilder()
+        floor = read_floor(beside, place, floor_report)
         floor.attachments += read_underlay(under)
         beside += under
         side_files = [read_truth(source.files[0]) for source in found]
@@ -154,7 +154,7 @@ def convert(
                     if strict:
                         imported.refuse_changes(source.files[0])
                     merged.add(source, setting, side, imported, written)
-                report = merged.report(told.build())
+                report = merged.report(floor_report.build())
                 for name, record in (merged.records(report) | {"provenance": origin.result()}).items():
                     recording.add_metadata(name, record)
                 for item in merged.attachments:

@@ -205,9 +205,9 @@ def time_unit(
     values = first.drop_nulls()
     size = float(np.median(values.to_numpy()))
     clock = "unix" if any(size >= least for least, _ in EPOCHS) else "device"
-    said = (UNIT.findall(name.lower()) or [re.split(r"[_\s]", name.lower())[-1]])[-1].strip()
-    if said in SECONDS:
-        unit = SECONDS[said]
+    unit_name = (UNIT.findall(name.lower()) or [re.split(r"[_\s]", name.lower())[-1]])[-1].strip()
+    if unit_name in SECONDS:
+        unit = SECONDS[unit_name]
         return TimeUnit(unit, "unix" if size * unit >= 1e8 else "device")
     if clock == "unix":
         return TimeUnit(next(unit for least, unit in EPOCHS if size >= least), "unix")

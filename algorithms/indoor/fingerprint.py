@@ -161,12 +161,12 @@ class IndoorFingerprint(PlainEstimator):
 
     def remarks(self) -> list[Remark]:
         """Say how many windows had no fix, and what the survey does not know."""
-        said: list[Remark] = []
+        remarks: list[Remark] = []
         if not hasattr(self, "counts"):
-            return said
+            return remarks
         if few := self.counts["few"]:
             whole = few + self.counts["fixes"]
-            said.append(
+            remarks.append(
                 Remark(
                     "too_few_transmitters",
                     f"{few} of {whole} windows hear fewer than {self.params.least} transmitters of the survey: no fix; "
@@ -175,9 +175,9 @@ class IndoorFingerprint(PlainEstimator):
                 )
             )
         if self.unknown:
-            said.append(
+            remarks.append(
                 Remark(
                     "unknown_transmitter", f"{len(self.unknown)} transmitters are not in the survey; left out"
                 )
             )
-        return said
+        return remarks

@@ -150,5 +150,5 @@ class IndoorSmooth(PlainEstimator):
         """Say what a user must know of the run."""
         if not hasattr(self, "ahead"):
             return []
-        said = self.ahead.remarks()
-        return [dataclasses.replace(r, fatal=False) if self.kept else r for r in said]
+        remarks = self.ahead.remarks()
+        return [dataclasses.replace(r, fatal=False) if self.kept else r for r in remarks]

@@ -105,8 +105,8 @@ class MpuEncoderMat:
             tables.append((ChannelSpec(f"/leg/{name}/imu", IMU, f"{name}_imu"), pl.DataFrame(columns)))
             parts = [quats[f"quat{k}{q}"] for q in range(1, 5)]
             if all(p in values for p in parts):
-                said = {"source": "the device's own (DMP)"}
-                spec = ChannelSpec(f"/leg/{name}/orientation", ORIENTATION, f"{name}_imu", metadata=said)
+                metadata = {"source": "the device's own (DMP)"}
+                spec = ChannelSpec(f"/leg/{name}/orientation", ORIENTATION, f"{name}_imu", metadata=metadata)
                 turned = pl.DataFrame({q: values[p] for q, p in zip(QUAT, parts, strict=True)})
                 tables.append((spec, turned))
         first, second = names.values()

@@ -204,8 +204,8 @@ def _node(path: Path, header: Header, wanted: str | None) -> str:
         return nodes[0]
     if wanted in nodes:
         return wanted
-    said = f"has no node {wanted!r}" if wanted is not None else f"has {len(nodes)} nodes"
-    raise UsageError(f"{path}: {said}; choose one with node=: {', '.join(nodes)}")
+    fault = f"has no node {wanted!r}" if wanted is not None else f"has {len(nodes)} nodes"
+    raise UsageError(f"{path}: {fault}; choose one with node=: {', '.join(nodes)}")
 
 
 def _columns(header: Header, node: str) -> dict[str, SourceColumn]:
