@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterable
 from typing import Any
 
+import numba
 import numpy as np
 import polars as pl
 import pytest
@@ -26,7 +27,6 @@ from marcha.algorithms import (
 from marcha.algorithms.numerics.compiled import compiled
 from marcha.recording import MarchaError, UsageError
 from marcha.replay import Engine, GapPolicy, LiveSource, TableSink, plan_runs, replay
-from numba import njit
 
 from .event_loop import drive
 from .replay_helpers import ACC, IMU, STEP_NS, VALUES, MemorySource, channel, run_all, same_bits, table
@@ -464,7 +464,9 @@ def test_the_context_holds_what_the_recording_says() -> None:
 def test_compiling_is_no_part_of_a_runs_time() -> None:
     """A kernel that was never called: its compilation takes far longer than its loop, and is not in it."""
 
-    @njit(_nrt=False)
+    compile_once: Any = numba.njit(_nrt=False)  # pyright: ignore[reportCallIssue]
+
+    @compile_once
     def never_called(
         state: Any,
         inputs: Any,
