@@ -5,10 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import marcha.recording as mr
+import numpy as np
 import pytest
+from marcha.algorithms import make
+from marcha.algorithms.joint.chain import measure_angles
 from marcha.ingest import convert
+from marcha.ingest.anatomy import cardan
 from marcha.ingest.simulate import simulate
 from marcha.replay import Run, evaluate, replay
+from scipy.spatial.transform import Rotation
 
 
 @pytest.fixture(scope="module")
@@ -56,3 +61,17 @@ def test_a_chain_of_three_joints_by_rotations(legs: mr.Recording) -> None:
         r.metrics[f"rmse_unbiased_deg.{s}_knee"] < 3.0
         for r, s in zip(result.runs, ("left", "right"), strict=True)
     )
+
+
+def test_all_three_angles_have_the_references_signs() -> None:
+    """The chain's angles of known attitudes are those of the reference's definition, and of scipy's sequence XYZ."""
+    estimator = make("joint.relative", joint="free", position="0,0,0.2,0,0,-0.2")
+    state = estimator.state[0]
+    turns = Rotation.random(20, np.random.default_rng(1)), Rotation.random(20, np.random.default_rng(2))
+    expected = cardan(*(t.as_matrix() for t in turns))
+    for k in range(20):
+        state["n"], state["mount"][:2] = 2, np.eye(3)
+        state["rot"][0], state["rot"][1] = turns[0][k].as_matrix(), turns[1][k].as_matrix()
+        measure_angles(estimator.state[0])
+        difference = (state["angle"][0] - expected[k] + np.pi) % (2 * np.pi) - np.pi
+        np.testing.assert_allclose(difference, 0.0, atol=1e-9)

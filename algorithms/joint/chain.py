@@ -346,7 +346,10 @@ def feed_back(s: Any) -> None:
 
 @compiled
 def measure_angles(s: Any) -> None:
-    """Write the angles of every joint and the standard deviation of its flexion."""
+    """Write the angles of every joint and the standard deviation of its flexion.
+
+    M, the lower segment seen from the upper one, is Rx(−flexion) Ry(−abduction) Rz(−rotation) (Grood and Suntay 1983).
+    """
     for j in range(s.n - 1):
         u, w = s.rot[j], s.rot[j + 1]
         m, o = s.mount[j], s.mount[j + 1]
@@ -360,14 +363,14 @@ def measure_angles(s: Any) -> None:
             ly = w[k, 0] * o[1, 0] + w[k, 1] * o[1, 1] + w[k, 2] * o[1, 2]
             lz = w[k, 0] * o[2, 0] + w[k, 1] * o[2, 1] + w[k, 2] * o[2, 2]
             c00 += lx * ux
-            c01 += lx * uy
-            c02 += lx * uz
-            c12 += ly * uz
+            c01 += ux * ly
+            c02 += ux * lz
+            c12 += uy * lz
             c22 += lz * uz
-        s.angle[j, 0] = near(math.atan2(-c12, c22), s.angle[j, 0])
-        s.angle[j, 1] = math.asin(max(-1.0, min(1.0, c02)))
-        s.angle[j, 2] = math.atan2(-c01, c00)
-        to_nav(s, j + 1, o[0, 0], o[0, 1], o[0, 2], s.u)
+        s.angle[j, 0] = near(math.atan2(c12, c22), s.angle[j, 0])
+        s.angle[j, 1] = -math.asin(max(-1.0, min(1.0, c02)))
+        s.angle[j, 2] = math.atan2(c01, c00)
+        to_nav(s, j, m[0, 0], m[0, 1], m[0, 2], s.u)
         total = 0.0
         for a in range(3):
             for b in range(3):

@@ -196,8 +196,8 @@ class JointHinge(ChainEstimator):
 class JointRelative(ChainEstimator):
     """Orientations of two to four segments and angles of hinge, two-axis and free joints (6D).
 
-    Angles are Cardan angles of the lower segment's frame against the upper's: flexion about x, abduction about y,
-    rotation about z (rotation matrix of upper in lower = Rx(flexion) Ry(abduction) Rz(rotation)). Relative
+    Angles are Cardan angles of the lower segment's frame M in the upper one, the joint coordinate system of Grood and
+    Suntay (1983): M = Rx(−flexion) Ry(−abduction) Rz(−rotation), as the reference angles of markers have it. Relative
     heading is observable by a hinge or two-axis joint, or by the joint's position under motion; without any of them
     it drifts, and a remark says so. Ours.
     """
