@@ -19,6 +19,7 @@ from . import Row
 
 MODULES = (
     "recording",
+    "export",
     "ingest",
     "replay",
     "engine",

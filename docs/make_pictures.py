@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import marcha.ingest as ingest
@@ -63,6 +64,24 @@ def domains(folder: Path, images: Path) -> None:
             save(picture, images / f"viewer-{name}.png")
 
 
+def plain(recording: Path, image: Path) -> None:
+    """Take the picture of a recording as Rerun opens it without marcha (``rerun FILE.mcap``)."""
+    from marcha.viz import viewer
+    from PIL import Image
+    from rerun.experimental import ViewerClient
+
+    with viewer.native(headless=True, size=(1400, 800)) as process:
+        client = ViewerClient.connect(viewer.uri(process.port))
+        client.open(str(recording.resolve()))
+        until = time.monotonic() + 60
+        while time.monotonic() < until and not ((s := client.get_state()).recordings and not s.loading):
+            time.sleep(0.1)
+        time.sleep(4)  # plots find their bounds some frames later
+        shot = Image.open(io.BytesIO(client.take_screenshot())).convert("RGB")
+    shot.quantize(64, dither=Image.Dither.NONE).save(image, optimize=True)
+    print(image)
+
+
 def page(folder: Path, image: Path) -> None:
     """Take the picture of a report's part by label, where a Chromium is installed."""
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
@@ -86,6 +105,7 @@ def page(folder: Path, image: Path) -> None:
     subprocess.run([chromium, *options, f"--screenshot={shot}", str(folder / "leg.html")], check=True)
     Image.open(shot).convert("RGB").quantize(240, dither=Image.Dither.NONE).save(image, optimize=True)
     print(image)
+    plain(folder / "leg.mcap", image.with_name("rerun-plain.png"))
 
 
 def marked(walk: mr.Recording, folder: Path) -> mr.Recording:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -294,11 +295,13 @@ def systems(rec: Recording, topics: list[str], options: Selection) -> list[Syste
     A device is the first part of a topic, a run for estimates.
     """
     groups: dict[tuple[str, str], list[str]] = {}
+    alike = Counter((_device(t), rec.channels[t].count) for t in topics)
     for topic in topics:
-        t_ns = rec.table(topic, start_ns=options.start_ns, end_ns=options.end_ns)["t_ns"]
-        parts = topic.strip("/").split("/")
-        device = parts[1] if topic.startswith(ESTIMATE) and len(parts) > 2 else parts[0]
-        key = f"{len(t_ns)}/{t_ns.hash(0).sum()}" if len(t_ns) else ""
+        device, count = _device(topic), rec.channels[topic].count
+        key = f"{count}"
+        if alike[device, count] > 1:  # only channels of as many rows can have the same times
+            t_ns = rec.table(topic, start_ns=options.start_ns, end_ns=options.end_ns)["t_ns"]
+            key = f"{count}/{len(t_ns)}/{t_ns.hash(0).sum()}" if len(t_ns) else ""
         groups.setdefault((device, key), []).append(topic)
     out, taken = [], set()
     for (device, _), members in groups.items():
@@ -312,6 +315,11 @@ def systems(rec: Recording, topics: list[str], options: Selection) -> list[Syste
         taken.add(label.lower())
         out.append(System(label, name, members))
     return out
+
+
+def _device(topic: str) -> str:
+    parts = topic.strip("/").split("/")
+    return parts[1] if topic.startswith(ESTIMATE) and len(parts) > 2 else parts[0]
 
 
 def _write_system(
