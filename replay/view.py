@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 VELOCITY = ("vel_x", "vel_y", "vel_z")
 PLAN = "plan"
+WALKED_S = 1.0
+"""On a plan a reference is of somebody who walks: so far between its samples it is a straight line to a decimetre."""
 Loader = Callable[[str, "Sequence[str] | None"], "pl.DataFrame | None"]
 Stream = Callable[[str], "tuple[int, Iterator[pl.DataFrame]] | None"]
 
@@ -321,6 +323,8 @@ def compare(view: RunView, alignment: str) -> Comparison | None:
     reference = with_stays(reference, view.max_gap_s)
     sparse = is_sparse(reference, view.max_gap_s)
     max_gap_s = view.max_gap_s
+    if view.reference_frame == PLAN and not sparse:
+        max_gap_s = max(max_gap_s, WALKED_S)
     if sparse and is_sparse(track, max_gap_s) and (steps := view.table("step")) is not None:
         track, max_gap_s = stepwise(track, steps, *view.input_span), np.inf
     kept, other = (reference, track) if sparse else (track, reference)
