@@ -99,7 +99,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("viz")
     raw = write_walk(folder / "walk.mcap")
     live = viz.LiveSink(folder / "live.rrd")
-    estimators = ["foot.9iez", "shoe=foot.9iez[detector=shoe]"]
+    estimators = ["foot.9iez[detector=c1c2c3]", "shoe=foot.9iez[detector=shoe]"]
     rp.replay(raw, estimators, out=folder / "done.mcap", sinks=[live])
     viz.write_rrd(mr.open(folder / "done.mcap"), folder / "done.rrd")
     return folder
