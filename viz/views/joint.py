@@ -15,7 +15,7 @@ import rerun as rr
 from ...recording.rotations import xyzw_from_wxyz
 from ...replay.alignment import match
 from .. import style
-from ..canvas import ESTIMATES, JOINTS, RAW, Canvas, ChannelLike, Floats, Times, columns_of
+from ..canvas import ESTIMATES, JOINTS, RAW, Canvas, ChannelLike, Floats, Times, columns_of, entity
 from ..curve import Curve
 from .base import View, role_of
 from .common import EULER, Values, euler_deg, slug
@@ -238,13 +238,14 @@ class Orientation(View):
             canvas.lines(path, [f"{self.owner} {axis} (°)"], [color])
             panel = f"{self.segment} {axis} (°)"
             canvas.show("plot", path, tab=JOINTS, panel=panel, owner=self.owner, stack=self.segment)
-        self.figure = f"{self.parent}/figure"
+        holder = holder_of(canvas, self.channel)
+        self.figure = f"{holder}/figure"
         side, kind = split_side(self.segment)
         self.bone = bone_of(self.channel, kind)
         self.tips = tips_of(canvas, self.figure)
         parent = side + PARENTS.get(kind, "")
         above = [
-            segment_of(c.topic) for c in canvas.channels if canvas.group(c.topic).startswith(self.parent)
+            segment_of(c.topic) for c in canvas.channels if canvas.group(c.topic).startswith(f"{holder}/")
         ]
         self.above = parent if kind in PARENTS and parent in above else previous(canvas, self.channel)
         self.waiting: list[tuple[Times, Floats]] = []
@@ -350,6 +351,13 @@ def segment_of(topic: str) -> str | None:
     return None
 
 
+def holder_of(canvas: Canvas, channel: ChannelLike) -> str:
+    """Return the entity whose segments hang together: ``/run/<run>``, ``/reference`` of ``…/thigh/orientation``."""
+    parent = canvas.group(channel.topic).rpartition("/")[0]
+    above, _, last = parent.rpartition("/")
+    return above if last == entity(segment_of(channel.topic) or "").strip("/") and above else parent
+
+
 def split_side(name: str) -> tuple[str, str]:
     """Return side and kind of a segment: ``left_thigh`` is ("left_", "thigh")."""
     for side in ("left_", "right_", "l_", "r_"):
@@ -372,7 +380,7 @@ def previous(canvas: Canvas, channel: ChannelLike) -> str | None:
     name = segment_of(channel.topic) or ""
     if not name.startswith("segment"):
         return None
-    parent = canvas.group(channel.topic).rpartition("/")[0]
+    parent = holder_of(canvas, channel)
     before = f"segment{name[7:].rstrip('0123456789')}{int(name[7:].strip('_')) - 1}"
     there = [segment_of(c.topic) for c in canvas.channels if canvas.group(c.topic).startswith(parent)]
     return before if before in there else None
