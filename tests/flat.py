@@ -62,7 +62,7 @@ def growth(task: Callable[[], object], count: int, before: int = 10) -> Held:
     for _ in range(count):
         task()
     last = held()
-    return Held(*(b - a for a, b in zip(first, last, strict=True)))
+    return Held(last.threads - first.threads, last.files - first.files, last.memory_mb - first.memory_mb)
 
 
 def main() -> int:

@@ -106,7 +106,7 @@ def mutate(rng: Rng, data: bytes) -> Mutated:
         said = ""
         for _ in range(int(rng.choice([1, 1, 2, 4]))):
             change = pick(rng, _CHANGES)
-            said += change(rng, parts) + " "  # type: ignore[operator]
+            said += change(rng, parts) + " "
         if rng.random() < 0.5:
             parts = _without_summary(parts)
             said += "unindexed"
@@ -133,7 +133,7 @@ def _without_summary(parts: list[Record]) -> list[Record]:
 
 def _any(rng: Rng, parts: list[Record], *kinds: int) -> int | None:
     at = [k for k, r in enumerate(parts) if not kinds or r.opcode in kinds]
-    return int(pick(rng, at)) if at else None  # type: ignore[call-overload]
+    return int(pick(rng, at)) if at else None
 
 
 def _order(rng: Rng, parts: list[Record]) -> str:
@@ -153,7 +153,7 @@ def _order(rng: Rng, parts: list[Record]) -> str:
 def _length(rng: Rng, parts: list[Record]) -> str:
     at = _any(rng, parts)
     if at is not None:
-        parts[at].length = (len(parts[at].body) + int(pick(rng, (*NUMBERS, -2, 3, 9)))) % (1 << 64)  # type: ignore[call-overload]
+        parts[at].length = (len(parts[at].body) + int(pick(rng, (*NUMBERS, -2, 3, 9)))) % (1 << 64)
     return "length"
 
 
@@ -172,7 +172,7 @@ def _field(rng: Rng, parts: list[Record]) -> str:
             (Opcode.METADATA, Opcode.ATTACHMENT, Opcode.METADATA_INDEX, Opcode.ATTACHMENT_INDEX),
         ),
     )
-    at = _any(rng, parts, *kinds)  # type: ignore[misc]
+    at = _any(rng, parts, *kinds)
     if at is None or len(parts[at].body) < 8:
         return "none"
     body, size = bytearray(parts[at].body), int(rng.choice([2, 4, 8]))
@@ -181,7 +181,7 @@ def _field(rng: Rng, parts: list[Record]) -> str:
         if len(body) > size
         else 0
     )
-    body[place : place + size] = (int(pick(rng, NUMBERS)) % (1 << 8 * size)).to_bytes(size, "little")  # type: ignore[call-overload]
+    body[place : place + size] = (int(pick(rng, NUMBERS)) % (1 << 8 * size)).to_bytes(size, "little")
     parts[at] = Record(parts[at].opcode, bytes(body))
     return f"field of {parts[at].opcode}"
 
@@ -224,16 +224,16 @@ def _chunk(rng: Rng, parts: list[Record]) -> str:
         data = b"".join(r.bytes() for r in inner)
         size, crc = len(data), zlib.crc32(data)
     elif how == 3:
-        size = int(pick(rng, (*NUMBERS, size + 1, size - 1)))  # type: ignore[call-overload]
-        crc = int(pick(rng, (0, crc)))  # type: ignore[call-overload]
+        size = int(pick(rng, (*NUMBERS, size + 1, size - 1)))
+        crc = int(pick(rng, (0, crc)))
     elif how == 4:
-        data, crc = bytes(int(pick(rng, (0, 1, 1 << 20, 1 << 27 if name in ("zstd", "lz4") else 1 << 16)))), 0  # type: ignore[call-overload]
-        size = int(pick(rng, (len(data), 100)))  # type: ignore[call-overload]
+        data, crc = bytes(int(pick(rng, (0, 1, 1 << 20, 1 << 27 if name in ("zstd", "lz4") else 1 << 16)))), 0
+        size = int(pick(rng, (len(data), 100)))
     elif how == 5:
         data = blind(rng, data).data
         size, crc = len(data), 0
     else:
-        first, last = (int(pick(rng, NUMBERS)) % (1 << 64) for _ in "ab")  # type: ignore[call-overload]
+        first, last = (int(pick(rng, NUMBERS)) % (1 << 64) for _ in "ab")
     parts[at] = Record(Opcode.CHUNK, _packed(first, last, size % (1 << 64), crc % (1 << 32), data, name))
     return f"chunk {how} {name!r}"
 
@@ -245,17 +245,17 @@ def _message(rng: Rng, inner: list[Record]) -> None:
     body = bytearray(inner[at].body)
     how = int(rng.integers(6))
     if how == 0:
-        body[0:2] = struct.pack("<H", int(pick(rng, (0, 1, 2, 77, 65535))))  # type: ignore[call-overload]
+        body[0:2] = struct.pack("<H", int(pick(rng, (0, 1, 2, 77, 65535))))
     elif how == 1:
-        place = int(pick(rng, (6, 14)))  # type: ignore[call-overload]
-        body[place : place + 8] = (int(pick(rng, NUMBERS)) % (1 << 64)).to_bytes(8, "little")  # type: ignore[call-overload]
+        place = int(pick(rng, (6, 14)))
+        body[place : place + 8] = (int(pick(rng, NUMBERS)) % (1 << 64)).to_bytes(8, "little")
     elif how == 2:
         body = body[: int(rng.integers(0, len(body) + 1))]
     elif how == 3:
         body += rng.bytes(int(rng.choice([1, 4, 100])))
     elif how == 4 and len(body) > 34:
         place = int(rng.integers(22, len(body) - 4))
-        body[place : place + 4] = (int(pick(rng, NUMBERS)) % (1 << 32)).to_bytes(4, "little")  # type: ignore[call-overload]
+        body[place : place + 4] = (int(pick(rng, NUMBERS)) % (1 << 32)).to_bytes(4, "little")
     else:
         inner.insert(int(rng.integers(len(inner) + 1)), inner[at])
     inner[at] = Record(Opcode.MESSAGE, bytes(body))
@@ -389,7 +389,7 @@ def odd(rng: Rng, data: bytes) -> bytes:
         compression=packing,
         use_chunking=bool(rng.random() < 0.8),
         chunk_size=int(rng.choice([1 << 10, 1 << 16, 1 << 20])),
-    )  # type: ignore[arg-type]
+    )
     writer.start(str(pick(rng, ("ros2", "", "x"))), "another program")
     schemas: dict[int, int] = {}
     channels: dict[int, int] = {}
@@ -422,13 +422,13 @@ def odd(rng: Rng, data: bytes) -> bytes:
             first = log if first is None else first
             log, publish = (max(0, t - first + shift if shift < 0 else t + shift) for t in (log, publish))
             if rng.random() < 0.02:
-                publish = int(pick(rng, (0, log, 2**63, 2**64 - 1)))  # type: ignore[call-overload]
+                publish = int(pick(rng, (0, log, 2**63, 2**64 - 1)))
             body = bytearray(message.body[22:])
             if rng.random() < 0.02 and len(body) > 60:
                 at = int(rng.integers(40, len(body) - 8)) // 8 * 8 + 4
                 body[at : at + 8] = struct.pack(
                     "<d", float(pick(rng, (float("nan"), float("inf"), 1e308, -1e308, 5e-324)))
-                )  # type: ignore[arg-type]
+                )
             writer.add_message(channels.get(channel, 1), log, bytes(body), publish, sequence)
             for other, payload in extra:
                 if rng.random() < 0.01:

@@ -12,6 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
@@ -238,17 +239,17 @@ def _say(log: Path | None, what: dict[str, object]) -> None:
             out.write(json.dumps(what) + "\n")
 
 
-def report(result: Result, seed: int, *, file: object = None) -> None:
+def report(result: Result, seed: int, *, file: TextIO | None = None) -> None:
     """Print what a run found."""
     out = sys.stdout if file is None else file
     for place, found in sorted(result.failed.items(), key=lambda f: -f[1].count):
         print(
             f"\n{found.count} × {place}\n  --only {found.target!r} --seed {seed} --first {found.number}",
             file=out,
-        )  # type: ignore[call-overload]
-        print("  " + found.verdict.detail.strip()[-1500:].replace("\n", "\n  "), file=out)  # type: ignore[call-overload]
+        )
+        print("  " + found.verdict.detail.strip()[-1500:].replace("\n", "\n  "), file=out)
     print(
         f"\n{result.inputs} inputs in {result.seconds:.0f} s ({result.cpu_s / 3600:.2f} h of processor), "
         f"{result.failures} failures of {len(result.failed)} kinds",
-        file=out,  # type: ignore[call-overload]
+        file=out,
     )

@@ -182,7 +182,7 @@ def studies() -> dict[str, bytes]:
 
 def make(folder: Path) -> Seeds:
     """Return all sound inputs."""
-    samples = [sample(c, folder / c.__name__) for c in contracts()]
+    samples = [sample(c, folder / f"{k}-{c.__name__}") for k, c in enumerate(contracts())]
     data = recordings(folder / "recordings")
     rows = {}
     for name, content in data.items():

@@ -210,7 +210,7 @@ def _damage(rng: Rng, name: str, data: bytes) -> Mutated:
 def _archive(rng: Rng, files: dict[str, bytes], folder: Path) -> Path:
     """Pack the files as a stranger would, and damage the archive."""
     path = folder / "in.zip"
-    packing = int(pick(rng, (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)))  # type: ignore[call-overload]
+    packing = int(pick(rng, (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)))
     with zipfile.ZipFile(path, "w", packing) as archive:
         for name, data in files.items():
             archive.writestr(name, data)
