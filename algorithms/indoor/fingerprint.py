@@ -115,7 +115,7 @@ class IndoorFingerprint(PlainEstimator):
             return []
         self.counts["fixes"] += 1
         numbers = np.array(sorted(self.powers))
-        heard = np.array([np.mean(self.powers[int(k)]) for k in numbers])
+        heard = np.array([np.mean(self.powers[int(k)]) for k in numbers], dtype=np.float64)
         (x, y), sd = self._nearest(numbers, heard) if self.field is None else self._likely(numbers, heard)
         return [
             Result("position", end_ns, (x, y, self.height)),

@@ -70,7 +70,7 @@ def coverage(where: Sequence[FloatArray]) -> dict[str, float]:
         place. 0 where places lie on a line.
     """
     import shapely
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     points = np.array([w[:2] for w in where], dtype=np.float64).reshape(-1, 2)
     hull = shapely.MultiPoint(points).convex_hull
@@ -83,7 +83,7 @@ def coverage(where: Sequence[FloatArray]) -> dict[str, float]:
     inside = shapely.contains_xy(hull, gx, gy)
     if not inside.any():
         return empty
-    far, _ = cKDTree(points).query(np.column_stack([gx[inside], gy[inside]]))
+    far, _ = KDTree(points).query(np.column_stack([gx[inside], gy[inside]]))
     return empty | {
         "median_m": float(np.median(far)),
         "p95_m": float(np.percentile(far, 95)),

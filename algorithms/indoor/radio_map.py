@@ -110,9 +110,9 @@ def field_of(where: FloatArray, powers: FloatArray) -> RadioField:
     powers : ndarray
         dBm, NaN where not heard, shape (m, transmitters).
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    tree = cKDTree(where)
+    tree = KDTree(where)
     apart = float(np.median(tree.query(where, k=2)[0][:, 1])) if len(where) > 1 else MARGIN_M
     margin = min(max(0.5 * apart, 0.5), MARGIN_M)
     low, high = where.min(axis=0) - margin, where.max(axis=0) + margin
