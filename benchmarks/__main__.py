@@ -24,7 +24,7 @@ MODULES = (
     "replay",
     "engine",
     "indoor",
-    "joint",
+    "phone", "joint",
     "startup",
     "viz",
     "page",

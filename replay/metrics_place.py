@@ -74,11 +74,11 @@ def places(view: RunView) -> dict[str, float]:
     """Errors of a run's places (``fix``) against fixes of a reference, a survey's line, withheld fixes."""
     ours = usable(view.table("fix"))
     if ours is None:
-        return waypoint_ellipse(view)
+        return waypoint_ellipse(view) | _radius(_local_covariances(view))
     plane = Plane(ours["lat_deg"][0], ours["lon_deg"][0])
     track = Places(ours["t_ns"].to_numpy(), plane(ours), stated_covariances(ours, view.table("state")))
     raw = _raw_fixes(view)
-    found: dict[str, float] = {}
+    found = _radius(track.cov)
     reference = usable(view.reference_table("fix")) if view.recording is not None else None
     survey = usable(view.survey)
     if reference is not None:
@@ -192,15 +192,34 @@ def waypoint_ellipse(view: RunView) -> dict[str, float]:
     compared = view.compared("origin")
     if compared is None or compared.on_estimate or len(compared.t_ns) < 2:
         return {}
-    sigma = view.table("sigma")
-    if sigma is None or not {"sigma_pos_x", "sigma_pos_y"} <= set(sigma.columns):
+    sigma, cov = view.table("sigma"), _local_covariances(view)
+    if sigma is None or not len(cov):
         return {}
-    cov = stated_covariances(sigma, view.table("state"), ("sigma_pos_x", "sigma_pos_y"))
     at = np.searchsorted(sigma["t_ns"].to_numpy(), compared.t_ns, "right") - 1
     later = at[1:] >= 0  # the first one has no error by definition
     begin = cov[at[0]] if at[0] >= 0 else np.zeros((2, 2))
     grown = cov[np.maximum(at[1:], 0)] - begin
     return _consistency(compared.error[1:, :2][later], grown[later])
+
+
+def _local_covariances(view: RunView) -> FloatArray:
+    """Return the covariances that a local track of a phone states; none of other estimators'."""
+    sigma = view.table("sigma")
+    if sigma is None or not {"sigma_pos_x", "sigma_pos_y"} <= set(sigma.columns):
+        return np.empty((0, 2, 2))
+    state = view.table("state")
+    if state is None or "correlation_en" not in state.columns:
+        return np.empty((0, 2, 2))
+    return stated_covariances(sigma, state, ("sigma_pos_x", "sigma_pos_y"))
+
+
+def _radius(cov: FloatArray) -> dict[str, float]:
+    """Return how sure a run is of its places: the longer half axis of the 95 % ellipse."""
+    cov = cov[np.isfinite(cov).all(axis=(1, 2))]
+    if not len(cov):
+        return {}
+    axis = np.sqrt(ELLIPSE95 * np.maximum(np.linalg.eigvalsh(cov)[:, -1], 0.0))
+    return {"accuracy95_median_m": float(np.median(axis)), "accuracy95_end_m": float(axis[-1])}
 
 
 # -- survey -------------------------------------------------------------------------------------------------

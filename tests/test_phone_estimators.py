@@ -15,6 +15,7 @@ from marcha.ingest import convert
 from marcha.ingest.simulate import PhoneWalk, phone_walk, simulate
 
 from .contracts.estimator import EstimatorContract, Tables
+from .phone_runs import run_phone, sensor_tables
 from .phone_samples import short_walk
 
 FIXES = ("lat_deg", "lon_deg", "alt_m", "sd_east_m", "sd_north_m", "sd_up_m")
@@ -147,3 +148,50 @@ def distances(pose: pl.DataFrame, walk: PhoneWalk) -> np.ndarray:
     return np.hypot(
         *(pose[f"pos_{a}"].to_numpy() - np.interp(t, true, walk.pos[:, i]) for i, a in enumerate("xy"))
     )
+
+
+@pytest.mark.parametrize(("placement", "works"), [("hand", True), ("pocket", False), ("armband", False)])
+def test_the_sources_chain_says_where_it_cannot_work(placement: str, works: bool, tmp_path: Path) -> None:
+    """Its heading is for a phone that is held level: elsewhere the run is fatal and names the remedy."""
+    made = simulate(
+        "phone-turns", tmp_path / "raw", seed=5, format="sensor-logger", rate_hz=20, placement=placement
+    )
+    convert(made.paths, tmp_path / "walk.mcap")
+    (run,) = rp.replay(mr.open(tmp_path / "walk.mcap"), ["phone.pdr-source"]).runs
+    assert run.fatal == (not works)
+    assert [f.detail for f in run.findings if f.kind == "not_level" and "phone.pdr" in f.detail] == (
+        [] if works else [f.detail for f in run.findings if f.kind == "not_level"]
+    )
+    assert bool(run.metrics) == works
+
+
+def test_offline_estimators_are_labelled(tmp_path: Path) -> None:
+    rec, _ = walked(tmp_path)
+    rp.replay(rec, ["phone.smooth", "phone.fused"], out=tmp_path / "done.mcap")
+    done = mr.open(tmp_path / "done.mcap")
+    assert done.metadata["run/phone_smooth_phone_gyr"]["offline"] == "true"
+    assert done.metadata["run/phone_fused_phone_gyr"]["offline"] == "false"
+
+
+def test_floors_by_the_barometer() -> None:
+    """Two flights of 3.4 m: the height at the end, and its stated deviation."""
+    walk = phone_walk("phone-floors", seed=3, rate_hz=25)
+    out = run_phone("phone.pdr", sensor_tables(walk))
+    climbed = float(walk.pos[-1, 2] - walk.pos[0, 2])
+    assert climbed == pytest.approx(6.8, abs=0.01)
+    assert out["pose"]["pos_z"][-1] == pytest.approx(climbed, abs=1.0)
+    assert 0.0 < out["sigma"]["sigma_pos_z"][-1] < 1.0
+    assert np.nansum(out["step"]["height_m"].to_numpy()) == pytest.approx(climbed, abs=1.0)
+
+
+@pytest.mark.parametrize("placement", ["pocket", "armband", "swinging"])
+def test_the_walking_direction_is_not_the_phones(placement: str) -> None:
+    """Found from the motion: within 25° after the first steps, turns included. Not in a bag (docs/phone.md)."""
+    walk = phone_walk(
+        "phone-turns", seed=4, placement=placement, rate_hz=50, hard_iron_sigma_t=0.0, soft_iron=0.0
+    )
+    out = run_phone("phone.pdr", sensor_tables(walk), declination_deg=float(np.degrees(walk.declination_rad)))
+    t = out["heading"]["t_ns"].to_numpy() - 300_000_000
+    true = np.interp(t - walk.t_ns[0], walk.t_ns - walk.t_ns[0], walk.heading_rad)
+    error = np.angle(np.exp(1j * (out["heading"]["walking_rad"].to_numpy() - true)))[8:]
+    assert np.degrees(np.median(np.abs(error))) < 25.0

@@ -229,6 +229,15 @@ class PhoneTrack(KernelEstimator):
         """Say what a user must know."""
         s = self.state[0]
         found = steps.step_remarks(s)
+        if s["mode"] == direction.MAGNETOMETER and s["steps"] and s["tilted"] > 0.5 * s["steps"]:
+            found.append(
+                Remark(
+                    "not_level",
+                    f"at {int(s['tilted'])} of {int(s['steps'])} steps the screen did not look up: eq 3.17 has no "
+                    "heading for a phone in a pocket, at the ear or on an arm; take phone.pdr there",
+                    fatal=True,
+                )
+            )
         if s["has_gyr"] and s["gyr_ns"] == 0:
             found.append(Remark("no_gyroscope", "no sample of the gyroscope arrived: headings stand still"))
         if not s["has_mag"] and not self.fused:

@@ -44,6 +44,7 @@ FIELDS: list[tuple[Any, ...]] = [
     ("part_length", "f8"),
     ("part_heading", "f8"),
     ("lost_fixes", "i8"),
+    ("tilted", "i8"),  # steps at which the screen did not look up
     ("far_fixes", "i8"),
     ("relocated", "i8"),
     ("sd_default", "f8"),
@@ -183,6 +184,8 @@ def _close_step(s: Any, at: int, out_message: Any, out_t_ns: Any, out: Any, k: i
     for j in range(ring.N_FEATURES):
         out[k, O_DETECTOR + j] = s.features[j]
     s.steps += 1
+    if s.level_up < direction.SCREEN_UP:
+        s.tilted += 1
     s.part_on = 0
     steps.shift_queue(s, 1)
 
