@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -22,8 +23,8 @@ from .contracts.importer import ImporterContract
 MARKS = ("hip", "knee_lat", "knee_med", "ankle_lat", "ankle_med", "heel", "toe")
 
 
-def squats(**options: float | str) -> LegCapture:
-    known: dict[str, float | str] = {"seed": 1, "duration_s": 10, "noise": "mems", "dropout_share": 0.0}
+def squats(**options: Any) -> LegCapture:
+    known: dict[str, Any] = {"seed": 1, "duration_s": 10, "noise": "mems", "dropout_share": 0.0}
     return leg("squats", **(known | options))
 
 

@@ -166,7 +166,7 @@ class JointSmooth(PlainEstimator):
         self._remarks = [
             Remark("axis_found", f"hinge axes of the whole recording ± {sd[0]:.1f}° and {sd[1]:.1f}°")
         ]
-        return self._angles(*(tables[s] for s in SEGMENTS), hinge)
+        return self._angles(tables["thigh"], tables["shank"], hinge)
 
     def _angles(self, upper: Any, lower: Any, hinge: dict[str, Any]) -> list[Result]:
         parts = [(t["t_ns"].to_numpy(), t.select(IMU_COLUMNS).to_numpy()) for t in (upper, lower)]

@@ -61,7 +61,7 @@ class Hinge(NamedTuple):
 
 def basis(axis: FloatArray) -> FloatArray:
     """Return a rotation (3, 3) with columns x, y across ``axis`` and the axis."""
-    x = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    x: FloatArray = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]).astype(np.float64)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(axis, x), axis], axis=1)
 
