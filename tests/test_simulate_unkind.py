@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,9 +40,9 @@ def test_every_error_is_drawn_by_the_seed_and_leaves_the_others_alone() -> None:
 
 @pytest.mark.parametrize("field", ["strap_acc", "strap_gyr", "acc_warmup_sigma", "gyr_warmup_sigma"])
 def test_each_error_shows_in_its_sensor_only(field: str) -> None:
-    quiet = {"errors": "none", "rest_s": 1.0}
+    quiet: dict[str, Any] = {"errors": "none", "rest_s": 1.0}
     ideal = sim.walk("straight", seed=2, **quiet).measured()
-    wrong = sim.walk("straight", seed=2, **quiet, **{field: 0.05}).measured()
+    wrong = sim.walk("straight", seed=2, **quiet, **{field: 0.05})  # pyright: ignore[reportArgumentType].measured()
     moved = [float(np.abs(a - b).max()) for a, b in zip(ideal, wrong, strict=True)]
     own = 0 if "acc" in field else 1
     assert moved[own] > 1e-3
