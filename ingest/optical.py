@@ -70,10 +70,10 @@ def float_rows(
         text = text.str.strip_chars().str.replace_all(r"[ \t]+", " ")
     blank = (text.str.strip_chars(" \t,;") == "").to_numpy()
     cells = (text.str.count_matches(separator, literal=True) + 1).to_numpy().astype(np.int64)
-    surplus = (cells > width).nonzero()[0]
-    for k in surplus[:1000].tolist():
-        if not text[k].split(separator, width)[-1].strip(f" {separator}"):
-            cells[k] = width  # trailing separators
+    if (cells > width).any():  # what is only separators at the end of a line is nothing
+        body = text.str.strip_chars_end(f" {separator}")
+        filled = (body.str.count_matches(separator, literal=True) + 1).to_numpy().astype(np.int64)
+        cells = np.where((cells > width) & (filled <= width), width, cells)
     bad = ~blank & (cells > width)
     good = np.flatnonzero(~blank & ~bad)
     values = np.empty((0, width))
