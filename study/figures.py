@@ -289,6 +289,7 @@ def by_walk(cells: Sequence[StudyCell], config: cfg.StudyConfig, column: str, un
         below.axhline(0, color="black", linewidth=0.6)
         above.set_title(f"{configuration}, mean |error| {np.abs(error).mean():.3g} {unit}", fontsize=9)
         below.set_xlabel("walk")
+        below.xaxis.get_major_locator().set_params(integer=True)
         if k == 0:
             above.set_ylabel(unit)
             below.set_ylabel(f"error ({unit})")
