@@ -139,10 +139,11 @@ def _encode(
                     if exact
                     else np.interp(at, analog.t_ns.astype(float), column, left=np.nan, right=np.nan)
                 )
-        file["data"]["analogs"] = np.stack(values)[None]
-        parameters["ANALOG"]["RATE"]["value"] = [rate * ratio]
-        parameters["ANALOG"]["LABELS"]["value"] = labels
-        parameters["ANALOG"]["UNITS"]["value"] = units
+        if values:  # a channel whose messages were lost has none
+            file["data"]["analogs"] = np.stack(values)[None]
+            parameters["ANALOG"]["RATE"]["value"] = [rate * ratio]
+            parameters["ANALOG"]["LABELS"]["value"] = labels
+            parameters["ANALOG"]["UNITS"]["value"] = units
     events = _events(marks, int(lead.t_ns[0]))
     if events:
         times = np.array([[t // 60, t % 60] for t, _, _ in events], float).T

@@ -140,7 +140,7 @@ class TimestampRepair:
     def _possible(self, frame: pl.DataFrame) -> pl.DataFrame:
         """Return the rows whose time a clock can say: arithmetic on others would wrap."""
         most = MOST_NS // self._tick_ns
-        good = frame["t"].is_between(-most, most)
+        good = frame["t"].is_between(-most, most).fill_null(False)
         if good.all():
             return frame
         at = int((~good).arg_true()[0])

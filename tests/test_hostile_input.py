@@ -6,7 +6,10 @@ import os
 import zipfile
 from pathlib import Path
 
+import polars as pl
 import pytest
+from marcha.ingest.contract import ReportBuilder
+from marcha.ingest.timestamps import TimestampRepair
 from marcha.recording import MarchaError
 from marcha.recording.errors import MOST_CHARACTERS, Finding
 
@@ -54,6 +57,16 @@ def test_a_time_beyond_any_clock_is_a_bad_row(tmp_path: Path, time: str) -> None
     assert done.code == 3
     assert {f["kind"]: f["count"] for f in done.document["report"]["findings"]}["bad_row"] == 1
     assert done.document["channels"][0]["count"] == 300
+
+
+def test_a_row_without_a_time_is_a_bad_row() -> None:
+    report = ReportBuilder()
+    repair = TimestampRepair(report, tick_ns=1)
+    frame = pl.DataFrame(
+        {"t": [0, 10, None, 20, 10**19 % 2**63], "line": [1, 2, 3, 4, 5], "x": [1.0, 2.0, 3.0, 4.0, 5.0]}
+    )
+    assert repair.feed(frame, final=True)["t_ns"].to_list()[:3] == [0, 10, 20]
+    assert report.dropped >= 1
 
 
 def test_a_log_of_nothing_but_such_times_is_one_line(tmp_path: Path) -> None:

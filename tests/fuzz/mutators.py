@@ -178,7 +178,7 @@ def _number_bytes(rng: Rng, data: bytearray) -> bytes:
         return bytes(data)
     at = int(rng.integers(0, min(len(data), int(rng.choice([64, 4096, 1 << 40]))) - size + 1))
     value = int(pick(rng, NUMBERS)) % (1 << 8 * size)
-    data[at : at + size] = value.to_bytes(size, str(pick(rng, ("little", "big"))))
+    data[at : at + size] = value.to_bytes(size, "little" if rng.random() < 0.5 else "big")
     return bytes(data)
 
 
