@@ -19,6 +19,7 @@ import marcha.recording as mr
 import marcha.replay as rp
 import marcha.viz as viz
 import polars as pl
+from marcha.export import export
 from marcha.ingest.simulate import simulate
 from marcha.recording.changes import change
 from marcha.viz.recording_page import recordings_page
@@ -108,6 +109,12 @@ def page(folder: Path, image: Path) -> None:
     plain(folder / "leg.mcap", image.with_name("rerun-plain.png"))
 
 
+def tracks(walk: mr.Recording, image: Path) -> None:
+    """Take the picture of tracks as Rerun opens them without marcha."""
+    export(walk, "mcap", walk.path.with_name("tracks.mcap"), options={"tracks": True})
+    plain(walk.path.with_name("tracks.mcap"), image)
+
+
 def marked(walk: mr.Recording, folder: Path) -> mr.Recording:
     """Mark three bad stretches in a walk."""
     zero = walk.start_ns or 0
@@ -168,6 +175,7 @@ def main() -> None:
         domains(folder, images)
         page(folder, images / "report.png")
         walk = replayed(folder, "rectangle", FILTERS, "rectangle")
+        tracks(walk, images / "rerun-tracks.png")
         rrd = viz.write_rrd(walk, folder / "rectangle.rrd")
         for picture in screenshots(rrd, ["Overview", "Raw", "Compare", "Report"], at=0.62):
             save(picture, images / f"viewer-{picture.tab.lower()}.png")

@@ -19,6 +19,7 @@ from ..recording import (
 from ..recording.errors import MarchaError
 from ..recording.events import SIDECAR, TABLE
 from ..recording.selection import Selection, selected_topics, within
+from .pointclouds import add_tracks, is_track
 from .rules import by_rules
 from .series import evenly
 
@@ -42,6 +43,10 @@ class McapOptions(Selection, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             ge=0, description="readings and estimates of numbers at even times of this rate (0: as recorded)"
         ),
     ] = 0.0
+    tracks: Annotated[
+        bool,
+        msgspec.Meta(description="add every trajectory as one sensor_msgs/PointCloud2, which Rerun draws"),
+    ] = False
 
 
 class McapExporter:
@@ -68,12 +73,16 @@ class McapExporter:
         topics = selected_topics(rec, options)
         data = [t for t in topics if rec.channels[t].schema != EVENT]
         kept = [t for t in data if options.estimates or not t.startswith(ESTIMATE)]
+        if options.tracks:  # drawn anew
+            kept = [t for t in kept if not is_track(rec, t)]
         with create(path, overwrite=overwrite) as out:
             if options.whole and not options.rate_hz:
                 tiers = [t for t, c in rec.channels.items() if options.annotations and c.schema == EVENT]
                 out.copy_from(rec, [*kept, *tiers])
             else:
                 _copy_part(rec, kept, options, out)
+            if options.tracks:
+                add_tracks(rec, kept, options, out)
             if options.annotations:
                 phases = by_rules(rec, ("stance", "step"), options)
                 phases = phases.filter(~pl.col("tier").is_in(rec.annotations["tier"].unique().implode()))

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from .cdr import (
     Bytes,
     Layout,
+    encode,
     layout_of_lengths,
     split_index,
 )
 from .codec import PREFIX, SECOND, Binding, check_times
-from .definitions import Library, load
+from .definitions import Library, load, short_name
 from .errors import MarchaError
 from .schemas import TECHNOLOGIES, ColumnGroup, Schema
 
@@ -452,3 +453,11 @@ def _fields(
         [(b.column, *_field(dtype, b.path)) for b in numbers],
         [(column, parts[f"{path}.sec"][1]) for column, path in times],
     )
+
+
+def message_record(schema: str, channel_id: int, t_ns: int, value: Mapping[str, Any]) -> bytes:
+    """Return the record of a message of any type that has a text; see :meth:`Writer.add_message`."""
+    library = load(schema)
+    message = encode(value, library[short_name(schema)], library)
+    prefix = np.array([(5, PREFIX.itemsize - 9 + len(message), channel_id, 0, t_ns, t_ns)], PREFIX)
+    return prefix.tobytes() + message

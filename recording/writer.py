@@ -28,16 +28,10 @@ from .annotations import (
 )
 from .codec import check_times, index_of
 from .definitions import full_text
-from .encoder import Chunk, Encoder
+from .encoder import Chunk, Encoder, message_record
 from .errors import MarchaError, UsageError
 from .events import SIDECAR, TABLE, events_text, sidecar, to_events
-from .mcapfile import (
-    CHUNK_SIZE,
-    ZSTD_LEVEL,
-    McapFile,
-    Packed,
-    pack,
-)
+from .mcapfile import CHUNK_SIZE, ZSTD_LEVEL, McapFile, Packed, pack
 from .schemas import find_schema
 from .threads import helpers
 
@@ -229,6 +223,31 @@ class Writer:
         while len(self._jobs) >= _QUEUE:
             self._jobs.popleft().result()
         self._jobs.append(self._worker.submit(self._put, out, out.encoder, arrays, t_ns, log))
+
+    def add_message(self, topic: str, schema: str, t_ns: int, value: Mapping[str, Any]) -> None:
+        """Write a channel of one message, of a type that has no table (``sensor_msgs/msg/PointCloud2``).
+
+        Parameters
+        ----------
+        topic, schema, t_ns
+            Topic, which is not there yet; a type whose text is in ``recording/msg``; when it was known.
+        value : mapping
+            Field name to value; see :func:`marcha.recording.cdr.encode`.
+
+        Raises
+        ------
+        UsageError
+            The topic is there already.
+        """
+        self._check_open()
+        file = self._caught_up()
+        if any(c.topic == topic for c in file.channels.values()) or topic in self._outputs:
+            raise UsageError(f"{self.path}: {topic}: the channel is there already")
+        id_ = file.free_id()
+        message = message_record(schema, id_, t_ns, value)
+        record = file.add_schema(schema, "ros2msg", full_text(schema).encode())
+        file.add_channel(Channel(id_, topic, "cdr", {"offered_qos_profiles": qos_profile(topic)}, record))
+        file.submit(pack_records, [(t_ns, message)], id_, self._level)
 
     def add_annotations(self, table: pl.DataFrame) -> None:
         """Add labelled intervals; may be called again.
