@@ -25,6 +25,7 @@ MODULES = (
     "engine",
     "indoor",
     "phone",
+    "phone_consistency",
     "joint",
     "startup",
     "viz",

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
 import polars as pl
 from marcha.algorithms import make
 from marcha.algorithms.contract import ChannelInfo, Context, KernelEstimator
-from marcha.ingest.simulate import PhoneWalk
+from marcha.ingest.simulate import PhoneWalk, phone_walk
+from marcha.replay.metrics_place import Plane, stated_covariances
 
 FIXES = ("lat_deg", "lon_deg", "alt_m", "sd_east_m", "sd_north_m", "sd_up_m")
+PLACEMENTS = ("hand", "pocket", "bag", "armband", "neck", "swinging")
+Places = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def sensor_tables(walk: PhoneWalk) -> dict[str, pl.DataFrame]:
@@ -77,3 +81,26 @@ def run_phone(name: str, tables: dict[str, pl.DataFrame], **params: Any) -> dict
         columns = dict(zip(output.columns, part[said].T, strict=True))
         found[output.name] = pl.DataFrame({"t_ns": t_ns[said], **columns})
     return found
+
+
+def fused(walk: PhoneWalk) -> Places:
+    """Return times (s), errors (n, 2) in metres, and covariances (n, 2, 2) that ``phone.fused`` states."""
+    out = run_phone("phone.fused", sensor_tables(walk))
+    fix = out["fix"]
+    t = fix["t_ns"].to_numpy() - walk.t_ns[0]
+    place = Plane(walk.options.lat_deg, walk.options.lon_deg)(fix)
+    true = np.column_stack([np.interp(t, walk.t_ns - walk.t_ns[0], walk.pos[:, i]) for i in range(2)])
+    return t * 1e-9, place - true, stated_covariances(fix, out["state"])
+
+
+@cache
+def carried(seed: int, scenario: str = "phone-100m") -> Places:
+    """Return :func:`fused` of a walk whose placement, course and gait the seed draws."""
+    rng = np.random.default_rng(seed)
+    options: dict[str, Any] = {
+        "placement": PLACEMENTS[seed % 6],
+        "course_deg": float(rng.uniform(0, 360)),
+        "step_m": float(rng.uniform(0.6, 0.8)),
+        "step_s": float(rng.uniform(0.5, 0.6)),
+    }
+    return fused(phone_walk(scenario, seed=seed, rate_hz=25, pressure_hz=0, **options))
