@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import resource
 import shutil
 import subprocess
@@ -80,7 +81,7 @@ def rows(scale: float = 1.0) -> list[Row]:
         few, many = folder / "few.mcap", folder / "many.mcap"
         write(few, count)
         write(many, 10 * count)
-        for to in ("parquet", "csv"):
+        for to in ("parquet", "csv", "bids"):
             small, large = (_peak_mb(to, path, folder / f"{to}-memory") for path in (few, many))
             what = f"memory of export as {to}, {10 * count:,} messages"
             found.append(
@@ -115,4 +116,6 @@ def _peak_mb(to: str, path: Path, out: Path) -> float:
 
 if __name__ == "__main__":
     export(mr.open(sys.argv[2]), sys.argv[1], sys.argv[3])
-    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    status = Path("/proc/self/status")  # ru_maxrss would count the memory of the process that forked us
+    peak = re.findall(r"VmHWM:\s+(\d+)", status.read_text()) if status.exists() else []
+    print(int(peak[0]) / 1024 if peak else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)

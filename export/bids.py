@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -19,7 +19,6 @@ from ..recording.events import bids_events, events_text, sidecar, to_events
 from ..recording.selection import Selection, selected_topics, within
 from .facts import origin, pretty
 from .folder import whole_folder
-from .series import rate_hz
 from .tables import EVENT, meaning
 
 VERSION = "1.9.0"
@@ -300,8 +299,11 @@ def systems(rec: Recording, topics: list[str], options: Selection) -> list[Syste
         device, count = _device(topic), rec.channels[topic].count
         key = f"{count}"
         if alike[device, count] > 1:  # only channels of as many rows can have the same times
-            t_ns = rec.table(topic, start_ns=options.start_ns, end_ns=options.end_ns)["t_ns"]
-            key = f"{count}/{len(t_ns)}/{t_ns.hash(0).sum()}" if len(t_ns) else ""
+            rows, digest = 0, 0
+            for (table,) in _rows(rec, [topic], options):
+                rows += table.height
+                digest = (digest + table["t_ns"].hash(0).sum()) % 2**64
+            key = f"{count}/{rows}/{digest}" if rows else ""
         groups.setdefault((device, key), []).append(topic)
     out, taken = [], set()
     for (device, _), members in groups.items():
@@ -326,19 +328,21 @@ def _write_system(
     files: _Files, rec: Recording, options: BidsOptions, system: System, stem: str
 ) -> list[tuple[str, str, str, str]]:
     """Write one tracking system; return where each column comes from."""
-    tables = {
-        t: rec.table(t, start_ns=options.start_ns, end_ns=options.end_ns, log_time=True)
-        for t in system.topics
-    }
-    t_ns = next(iter(tables.values()))["t_ns"].to_numpy()
-    rate = rate_hz(t_ns)
-    columns: dict[str, Any] = {"latency": pl.Series((t_ns - rec.start_ns) / 1e9)}
+    first = last = count = 0
+    later = dict.fromkeys(system.topics, False)  # known later than measured
+    for tables in _rows(rec, system.topics, options):
+        t_ns = tables[0]["t_ns"]
+        first, last, count = first if count else t_ns[0], t_ns[-1], count + len(t_ns)
+        for topic, table in zip(system.topics, tables, strict=True):
+            later[topic] |= (table[KNOWN_AT] != table["t_ns"]).any()
+    duration_ns = last - first
+    rate = (count - 1) * 1e9 / duration_ns if duration_ns > 0 else 0.0
     rows = [("latency", "n/a", "LATENCY", "n/a", "s", "n/a", rate, "time since the start of the recording")]
     origin_of: list[tuple[str, str, str, str]] = []  # name in the table, topic, column, kind of number
-    for topic, table in tables.items():
+    for topic in system.topics:
         schema = rec.channels[topic].schema
-        known = [KNOWN_AT] if (table[KNOWN_AT] != table["t_ns"]).any() else []
-        for column in [*numeric_columns(rec, topic), *known]:
+        types = rec.table(topic, start_ns=0, end_ns=0, log_time=True).schema
+        for column in [*numeric_columns(rec, topic), *([KNOWN_AT] if later[topic] else [])]:
             group, _, axis = column.rpartition("_")
             kind_of = _KINDS.get(group)
             joint = schema == "sensor_msgs/msg/JointState"
@@ -352,24 +356,24 @@ def _write_system(
             unit = _UNITS.get(about["unit"], about["unit"])
             frame = rec.channels[topic].frame_id or "n/a"
             name = f"{topic.strip('/').replace('/', '_')}_{column}"
-            values = table[column]
-            origin_of.append((name, topic, column, str(values.dtype)))
-            if column.endswith("_ns"):  # times of the clock count from the start of the recording
-                values, unit = (values - rec.start_ns) / 1e9, "s"
-            columns[name] = values.cast(pl.Int8) if values.dtype == pl.Boolean else values
+            origin_of.append((name, topic, column, str(types[column])))
+            if column.endswith("_ns"):
+                unit = "s"
             if kind == "ORNT":
                 unit = "n/a"
             rows.append(
                 (name, component, kind, topic.strip("/"), unit, _frame(frame), rate, about["meaning"])
             )
-    data = pl.DataFrame(columns).with_columns(pl.selectors.float().fill_nan(None))
-    data.write_csv(
-        files.place(f"{stem}_motion.tsv"),
-        separator="\t",
-        include_header=False,
-        null_value="n/a",
-        float_scientific=None,
-    )
+    with files.place(f"{stem}_motion.tsv").open("wb") as file:
+        for tables in _rows(rec, system.topics, options):
+            by_topic = dict(zip(system.topics, tables, strict=True))
+            columns = [_seconds(tables[0]["t_ns"], rec).alias("latency")]
+            columns += [
+                _cells(by_topic[topic], column, rec).alias(name) for name, topic, column, _ in origin_of
+            ]
+            pl.DataFrame(columns).with_columns(pl.selectors.float().fill_nan(None)).write_csv(
+                file, separator="\t", include_header=False, null_value="n/a", float_scientific=None
+            )
     heads = [
         "name",
         "component",
@@ -402,14 +406,39 @@ def _write_system(
         "SamplingFrequencyEffective": rate,
         "TrackingSystemName": system.name,
         "MotionChannelCount": len(rows),
-        "TrackedPointsCount": len(tables),
-        "RecordingDuration": float((t_ns[-1] - t_ns[0]) / 1e9) if len(t_ns) else 0.0,
+        "TrackedPointsCount": len(system.topics),
+        "RecordingDuration": duration_ns / 1e9,
         "MissingValues": "n/a",
         "RecordingType": "continuous",
         **{f"{k}ChannelCount": kinds.count(k) for k in _COUNTED if k in kinds},
     }
     files.json(f"{stem}_motion.json", facts)
     return origin_of
+
+
+def _rows(rec: Recording, topics: Sequence[str], options: Selection) -> Iterator[tuple[pl.DataFrame, ...]]:
+    """Yield the next rows, as many of each channel: channels of the same times may be known at others."""
+    held: list[pl.DataFrame] = [rec.table(t, start_ns=0, end_ns=0, log_time=True) for t in topics]
+    for window in rec.windows(topics, start_ns=options.start_ns, end_ns=options.end_ns):
+        held = [
+            pl.concat([h, window.tables[t]], how="diagonal_relaxed") if t in window.tables else h
+            for t, h in zip(topics, held, strict=True)
+        ]
+        whole = min(h.height for h in held)
+        if whole:
+            yield tuple(h.head(whole) for h in held)
+            held = [h.slice(whole) for h in held]
+
+
+def _seconds(t_ns: pl.Series, rec: Recording) -> pl.Series:
+    return pl.Series((t_ns.to_numpy() - rec.start_ns) / 1e9)  # Polars would multiply by a rounded 1e-9
+
+
+def _cells(table: pl.DataFrame, column: str, rec: Recording) -> pl.Series:
+    """Return a column as it is written: times from the start of the recording, flags as 0 and 1."""
+    if column.endswith("_ns"):
+        return _seconds(table[column], rec)
+    return table[column].cast(pl.Int8) if table[column].dtype == pl.Boolean else table[column]
 
 
 def _frame(frame_id: str) -> str:

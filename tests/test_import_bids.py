@@ -181,3 +181,31 @@ def test_the_origin_is_that_of_the_export(rec: Recording, tmp_path: Path) -> Non
     convert([table], tmp_path / "back.mcap")
     assert mr.open(tmp_path / "back.mcap").start_ns == START_NS
     assert isinstance(mr.open(tmp_path / "back.mcap").annotations, pl.DataFrame)
+
+
+def test_channels_known_at_other_times_stay_row_by_row(tmp_path: Path) -> None:
+    """Windows are cut by when rows were known; a tracking system's row is of one time, in every window."""
+    rows = 80_000  # more than a window holds
+    t_ns = START_NS + 10_000_000 * np.arange(rows)
+    with mr.create(tmp_path / "a.mcap") as out:
+        for name, late_ns in (("near", 0), ("far", 300 * 10**9)):
+            table = pl.DataFrame(
+                {
+                    "t_ns": t_ns,
+                    "t_log_ns": t_ns + late_ns,
+                    **{f"gyr_{a}": np.arange(rows) % 997.0 for a in "xyz"},
+                }
+            )
+            out.add_table(f"/foot/{name}", "sensor_msgs/msg/Imu", table, frame_id=name)
+    rec = mr.open(tmp_path / "a.mcap")
+    export(rec, "bids", tmp_path / "ds")
+    (path,) = (tmp_path / "ds").rglob("*_motion.tsv")
+    found = pl.read_csv(path, separator="\t", has_header=False)
+    assert found.shape == (rows, 1 + 3 + 3 + 1)
+    assert np.array_equal(found[:, 0].to_numpy(), (t_ns - rec.start_ns) / 1e9)
+    for column in range(1, 7):
+        assert np.array_equal(found[:, column].to_numpy(), np.arange(rows) % 997.0)
+    assert np.array_equal(found[:, 7].to_numpy(), (t_ns + 300 * 10**9 - rec.start_ns) / 1e9)
+    about = json.loads(path.with_name(path.name.replace(".tsv", ".json")).read_text())
+    assert about["SamplingFrequency"] == pytest.approx(100.0, rel=1e-12)
+    assert about["RecordingDuration"] == (rows - 1) / 100
