@@ -25,6 +25,9 @@ from ..units import conversion
 READ_S = 300.0
 """Longest time that reading a file may take (s)."""
 
+_MIPS = b"\x56"
+"""Fourth byte of the parameter section of a file of a MIPS processor; 84 is Intel, 85 DEC."""
+
 _CHILD = """
 import json, sys
 import ezc3d
@@ -188,8 +191,15 @@ def _read(path: Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
     if not path.is_file():
         raise MarchaError(f"{path}: no such file")
     with path.open("rb") as file:
-        if file.read(2)[1:] != b"\x50":
+        start = file.read(2)
+        if start[1:] != b"\x50":
             raise MarchaError(f"{path}: not a C3D file: its second byte is not 80")
+        file.seek(max(start[0] - 1, 0) * 512 + 3)
+        if file.read(1) == _MIPS:
+            raise MarchaError(
+                f"{path}: numbers of a MIPS or SGI processor (byte 4 of the parameters is 86), which ezc3d does not "
+                "read; save it in the PC (Intel) format, in Mokka: File, Export, C3D"
+            )
     try:
         done = subprocess.run(
             [sys.executable, "-I", "-c", _CHILD, str(path)], capture_output=True, timeout=READ_S, check=False
