@@ -5,6 +5,7 @@ Run by ``make package`` and CI; no pytest test, because it builds from the whole
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -28,9 +29,29 @@ def _missing(wheel: Path) -> list[str]:
         f"marcha/{p.relative_to(ROOT).as_posix()}" for p in (ROOT / "recording" / "msg").rglob("*.msg")
     ]
     wanted += [
-        f"marcha/{p.relative_to(ROOT).as_posix()}" for p in (ROOT / "replay" / "study").rglob("*.toml")
+        f"marcha/{p.relative_to(ROOT).as_posix()}" for p in (ROOT / "study" / "presets").rglob("*.toml")
     ]
     return sorted(set(wanted) - names)
+
+
+def _untyped(site: Path, folder: Path) -> str:
+    """Return what a type checker says of the installed packages that it does not take for typed (PEP 561)."""
+    packages = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"][
+        "packages"
+    ]
+    (folder / "use.py").write_text(
+        "# pyright: reportMissingTypeStubs=error\n" + "".join(f"import {name}\n" for name in packages)
+    )
+    (folder / "pyrightconfig.json").write_text("{}")
+    done = subprocess.run(
+        [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "use.py"],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(site)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return "" if done.returncode == 0 else done.stdout + done.stderr
 
 
 def main() -> int:
@@ -62,7 +83,10 @@ def main() -> int:
         subprocess.run(
             [sys.executable, "-c", code, str(target)], cwd=folder, check=True, stdout=subprocess.DEVNULL
         )
-    print(f"{wheel.name}: whole, and it runs from outside the checkout")
+        if said := _untyped(target, folder):
+            print(f"{wheel.name}: a type checker does not take it for typed\n{said}", file=sys.stderr)
+            return 1
+    print(f"{wheel.name}: whole, typed, and it runs from outside the checkout")
     return 0
 
 
