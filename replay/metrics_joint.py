@@ -30,7 +30,15 @@ LEAST_EVENTS = 3
 """Fewer events of one leg are no cycles."""
 _EVENT = re.compile(r"(heelstrike|heelcontact|footstrike|footcontact|initialcontact|hs|ic|cyclestart)")
 _SIDES = {"left": "left", "l": "left", "right": "right", "r": "right"}
-ATTITUDE_FIGURES = ("rmse_deg", "rmse_unbiased_deg", "bias_deg", "pearson_r", "delay_s")
+ATTITUDE_FIGURES = (
+    "rmse_deg",
+    "rmse_unbiased_deg",
+    "bias_deg",
+    "pearson_r",
+    "delay_s",
+    "within95_percent",
+    "nees",
+)
 _FOREIGN = re.compile(
     r"(?P<before>left_|right_|[LlRr]_?)?(?P<joint>[Hh]ip|[Kk]nee|[Aa]nkle)(_?[Aa]ngles?|_flexion)?(?P<after>_left|_right|_[lr])?"
 )
@@ -104,6 +112,21 @@ def delay_s(
         bend = cost[k - 1] - 2.0 * cost[k] + cost[k + 1]
         return float(fine[k] + (0.0005 * (cost[k - 1] - cost[k + 1]) / bend if bend > 0.0 else 0.0))
     return float(fine[k])
+
+
+def consistency(error_deg: FloatArray, sigma_deg: FloatArray) -> dict[str, float]:
+    """Return the share of errors inside the stated 95 % and the mean squared error over its stated variance.
+
+    Errors count with their mean: a mounting that is off, a reference's own error and delay are in them.
+    """
+    known = np.isfinite(sigma_deg) & (sigma_deg > 0.0)
+    if not known.any():
+        return {}
+    ratio = np.square(error_deg[known] / sigma_deg[known])
+    return {
+        "within95_percent": float(100.0 * np.mean(ratio <= 1.959964**2)),
+        "nees": float(np.mean(ratio)),
+    }
 
 
 def cmc(curves: FloatArray) -> float:
@@ -197,11 +220,12 @@ def figures(
     reference: FloatArray,
     starts_ns: IntArray | None = None,
     spans: IntArray | None = None,
+    stated: tuple[IntArray, FloatArray] | None = None,
 ) -> dict[str, float]:
     """Return all figures of one joint, names without the joint's; of stretches of time where they are given.
 
     Cycles are those of the whole walk that lie in a stretch whole; ``starts_ns`` of cycles count instead of the
-    signal's.
+    signal's. ``stated`` are the standard deviations that the estimate states (ns, rad).
     """
     at, value, truth = matched(t_ns, angle, ref_ns, reference)
     starts = starts_from_signal(at, truth) if starts_ns is None else starts_ns
@@ -226,6 +250,8 @@ def figures(
         "agreement_low_deg": low,
         "agreement_high_deg": high,
     }
+    if stated is not None:
+        found.update(consistency(error, np.degrees(np.interp(at - t_ns[0], stated[0] - t_ns[0], stated[1]))))
     ours, theirs = (np.concatenate(c) for c in zip(*curves, strict=True))
     whole = np.isfinite(ours).all(axis=1) & np.isfinite(theirs).all(axis=1)
     if whole.sum() >= 2:
@@ -241,13 +267,16 @@ def figures(
 
 
 def joints(view: RunView) -> dict[str, float]:
-    """Errors of joint angles: RMSE, bias, correlation, range of motion, delay, limits of agreement, cycles."""
+    """Errors of joint angles: RMSE, bias, correlation, range of motion, delay, limits of agreement, cycles; and the
+    share inside the stated 95 %.
+    """
     base = view.whole or view
+    sigma = base.table("sigma")
     found: dict[str, float] = {}
     for name, own, truth, sign in _pairs(base):
         events = events_of(base.annotations, name)
         starts = events if len(events) >= LEAST_EVENTS else None
-        values = figures(own[0], own[1], truth[0], sign * truth[1], starts, view.spans)
+        values = figures(own[0], own[1], truth[0], sign * truth[1], starts, view.spans, _stated(sigma, name))
         found.update({f"{key}.{name}": value for key, value in values.items()})
     return found
 
@@ -259,6 +288,7 @@ def attitudes(view: RunView) -> dict[str, float]:
     if ours is None:
         return {}
     found: dict[str, float] = {}
+    sigma = base.table("sigma")
     tables = base.reference_tables("orientation")
     for topic in sorted(tables, key=len, reverse=True):  # a source's own goes before those made of markers
         table = tables[topic]
@@ -275,7 +305,13 @@ def attitudes(view: RunView) -> dict[str, float]:
         truth = {"roll": np.arctan2(up[1], up[2]), "pitch": np.arctan2(-up[0], np.hypot(up[1], up[2]))}
         for angle in wanted:
             name = f"{segment}_{angle}"
-            values = figures(*_column(ours, name), table["t_ns"].to_numpy(), truth[angle], spans=view.spans)
+            values = figures(
+                *_column(ours, name),
+                table["t_ns"].to_numpy(),
+                truth[angle],
+                spans=view.spans,
+                stated=_stated(sigma, name),
+            )
             found.update({f"{key}.{name}": v for key, v in values.items() if key in ATTITUDE_FIGURES})
     return found
 
@@ -379,6 +415,11 @@ def _side_and_joint(name: str) -> tuple[str, str]:
 def joint_columns(table: pl.DataFrame) -> list[str]:
     """Return the columns that are angles of joints."""
     return [c for c in table.columns if c not in ("t_ns", "t_log_ns") and not c.endswith((".vel", ".effort"))]
+
+
+def _stated(sigma: pl.DataFrame | None, name: str) -> Series | None:
+    """Return times and stated standard deviations of an angle; None where a run states none."""
+    return None if sigma is None or sigma.is_empty() or name not in sigma.columns else _column(sigma, name)
 
 
 def _column(table: pl.DataFrame, name: str) -> tuple[IntArray, FloatArray]:

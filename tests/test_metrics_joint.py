@@ -28,6 +28,19 @@ def test_delay_is_found_at_another_rate() -> None:
     assert np.isnan(mj.delay_s(T, ANGLE, T, 0 * ANGLE))
 
 
+def test_share_inside_the_stated_95_percent() -> None:
+    """Errors drawn with a standard deviation of 1° against 1°, half of it and no statement."""
+    noisy = ANGLE + np.radians(np.random.default_rng(0).normal(size=T.size))
+    right = mj.figures(T, noisy, T, ANGLE, stated=(T[::2], np.full(T[::2].size, np.radians(1.0))))
+    assert right["within95_percent"] == pytest.approx(95.0, abs=1.5)
+    assert right["nees"] == pytest.approx(1.0, abs=0.1)
+    bold = mj.figures(T, noisy, T, ANGLE, stated=(T, np.full(T.size, np.radians(0.5))))
+    assert bold["within95_percent"] == pytest.approx(67.3, abs=4.0)  # erf(0.98 / √2)
+    assert bold["nees"] == pytest.approx(4.0, abs=0.4)
+    assert "nees" not in mj.figures(T, noisy, T, ANGLE)
+    assert mj.consistency(np.ones(3), np.full(3, np.nan)) == {}
+
+
 def test_range_of_motion_and_limits_of_agreement() -> None:
     assert mj.rom_error_deg(1.1 * ANGLE, ANGLE) == pytest.approx(6.0, abs=0.01)
     low, high = mj.bland_altman_deg(np.array([-1.0, 0.0, 1.0, 2.0]))
