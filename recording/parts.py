@@ -12,13 +12,16 @@ import polars as pl
 from .annotations import EVENT
 from .changes import HISTORY
 from .errors import UsageError
-from .events import SIDECAR, TABLE
+from .events import SIDECAR, TABLE, VOCABULARY
 from .provenance import source_file
 from .reader import Recording
 from .schemas import SCHEMAS
 from .selection import Selection, selected_topics
 from .writer import Writer
 
+_ORIGIN = re.compile(r"(^|/)(provenance|(cut|export)(_\d+)?|merge/\d+)$")
+"""Metadata records that say from which file a recording is, and from when."""
+_MERGED = re.compile(r"merge/\d+")
 _EVENTS = (TABLE, SIDECAR, HISTORY)
 _PRIVATE_KEY = re.compile(
     r"name|serial|\bmac\b|address|user|owner|subject|person|patient|date|birth|host|path|file|source|blake2b|uuid"
@@ -26,6 +29,8 @@ _PRIVATE_KEY = re.compile(
     re.IGNORECASE,
 )
 _FIX = "sensor_msgs/msg/NavSatFix"
+_OWN_CLOCK = "last_seen_ns"
+"""Times of the receiver's own clock: no offset of the recording moves them."""
 _RADIO = ("marcha_msgs/msg/RadioSignal", "marcha_msgs/msg/Ranging")
 
 
@@ -63,7 +68,9 @@ def cut(rec: Recording, out: Path | str, start_ns: int, end_ns: int, *, overwrit
         )
     with Writer(out, overwrite=overwrite) as file:
         _copy(file, rec, topics, chosen)
-        marks = rec.annotations.filter((pl.col("end_ns") >= start_ns) & (pl.col("start_ns") < end_ns))
+        begins, ends = pl.col("start_ns"), pl.col("end_ns")
+        ended = ends.is_between(begins, start_ns, closed="right")  # up to the cut: no instant of the part
+        marks = rec.annotations.filter((ends >= start_ns) & (begins < end_ns) & ~ended)
         file.add_annotations(
             marks.with_columns(
                 pl.col("start_ns").clip(lower_bound=start_ns), pl.col("end_ns").clip(upper_bound=end_ns - 1)
@@ -123,14 +130,21 @@ def merge(
     with Writer(out, overwrite=overwrite) as file:
         ids: set[str] = set()
         taken: set[str] = set()
+        vocabularies: dict[str, set[str]] = {}
         for number, (rec, offset, start) in enumerate(zip(recs, offsets, starts, strict=True), 1):
             topics = [t for t, c in rec.channels.items() if c.schema != EVENT]
             _copy(file, rec, topics, Selection(), offset, start)
+            tiers = f"{start.strip('/')}/" if start else ""
             marks = rec.annotations.with_columns(
                 pl.col("start_ns", "end_ns") + offset,
                 id=pl.when(~pl.col("id").is_in(list(ids))).then("id"),
-                tier=pl.concat_str(pl.lit(f"{start.strip('/')}/" if start else ""), "tier"),
+                tier=pl.concat_str(pl.lit(tiers), "tier"),
+                channel=pl.when(pl.col("channel").is_in(list(rec.channels)))
+                .then(pl.concat_str(pl.lit(start), "channel"))
+                .otherwise("channel"),
             )
+            for tier, words in rec.metadata.get(VOCABULARY, {}).items():
+                vocabularies.setdefault(tiers + tier, set()).add(words)
             ids |= set(marks["id"].drop_nulls())
             file.add_annotations(marks)
             name = _free(rec.path.stem, taken)
@@ -141,8 +155,11 @@ def merge(
                 if attachment.name not in _EVENTS:
                     data = rec.attachment(attachment.name)
                     file.add_attachment(f"{name}/{attachment.name}", data, attachment.media_type)
-            facts = {**_parent(rec), "offset_ns": str(offset), "prefix": start}
+            facts = {**_parent(rec), "offset_ns": str(offset), "prefix": start, "records": name}
             file.add_metadata(f"merge/{number}", facts)
+        agreed = {tier: words.pop() for tier, words in vocabularies.items() if len(words) == 1}
+        if agreed:  # what two recordings say differently stays below their names alone
+            file.add_metadata(VOCABULARY, agreed)
 
 
 def anonymize(
@@ -176,7 +193,14 @@ def anonymize(
         else:
             topics.append(topic)
             left.append(f"topic {topic}" + (f", frame {channel.frame_id}" if channel.frame_id else ""))
-            left += [f"channel {topic}: {k} = {v}" for k, v in channel.metadata.items() if not _is_private(k)]
+            left += _texts_of(rec, topic)
+            if _OWN_CLOCK in channel.columns:
+                removed.append(f"{topic}: {_OWN_CLOCK}, times of the receiver's own clock")
+            for key, value in channel.metadata.items():
+                if _is_private(key):
+                    removed.append(f"channel {topic}: {key}")
+                else:
+                    left.append(f"channel {topic}: {key} = {value}")
     with Writer(out, overwrite=overwrite) as file:
         addresses: dict[str, str] = {}
         _copy(file, rec, topics, Selection(), -rec.start_ns, "", addresses)
@@ -195,19 +219,42 @@ def anonymize(
         )
         if marks.height:
             removed.append(f"notes, metadata, ids and annotators of {marks.height} annotations")
-            left += [f"label {label!r}" for label in marks["label"].unique(maintain_order=True).to_list()]
-        for name, values in rec.metadata.items():
-            kept = {
-                k: v
-                for k, v in values.items()
-                if not _is_private(k) and name not in ("provenance", "cut") and not name.startswith("merge/")
-            }
-            removed += [f"metadata {name}: {k}" for k in values if k not in kept]
-            left += [f"metadata {name}: {k} = {v[:80]}" for k, v in kept.items()]
+            for column in ("tier", "label", "channel"):
+                texts = marks[column].drop_nulls().unique(maintain_order=True).to_list()
+                left += [f"{column} {text!r}" for text in texts if text]
+        files = _merged_names(rec)
+        for known, values in rec.metadata.items():
+            first, slash, rest = known.partition("/")
+            name = f"{files[first]}/{rest}" if slash and first in files else known
+            kept = {k: v for k, v in values.items() if not (_is_private(k) or _ORIGIN.search(name))}
+            removed += [f"metadata {known}: {k}" for k in values if k not in kept]
+            left += [f"metadata {name}: {k} = {v}" for k, v in kept.items()]
             if kept:
                 file.add_metadata(name, kept)
         removed += [f"attachment {a.name}" for a in rec.attachments]
     return Anonymized(removed, left)
+
+
+def _merged_names(rec: Recording) -> dict[str, str]:
+    """Return what a merge put before the names of records, names of files, and ``part1``… instead."""
+    return {
+        values.get("records", Path(values.get("source", "")).stem): f"part{name.partition('/')[2]}"
+        for name, values in rec.metadata.items()
+        if _MERGED.fullmatch(name)
+    }
+
+
+def _texts_of(rec: Recording, topic: str) -> list[str]:
+    """Return the names and texts that a channel's rows hold: joints, markers, frames."""
+    schema = SCHEMAS[rec.channels[topic].schema]
+    if schema.names:
+        return [f"column {topic}: {name}" for name in rec.channels[topic].columns]
+    return [
+        f"text {topic}: {column.name} = {text}"
+        for column in schema.columns
+        if column.kind == "text"
+        for text in rec.table(topic)[column.name].unique(maintain_order=True).to_list()
+    ]
 
 
 def _is_private(key: str) -> bool:
@@ -231,11 +278,17 @@ def _copy(
                 f"{rec.path}: {topic}: type {about.schema} cannot be written; leave the channel out"
             )
         metadata = {k: v for k, v in about.metadata.items() if addresses is None or not _is_private(k)}
-        file.add_channel(prefix + topic, about.schema, about.frame_id, about.columns, metadata)
+        metadata = {k: prefix + v if v in rec.channels else v for k, v in metadata.items()}
+        columns = [c for c in about.columns if addresses is None or c != _OWN_CLOCK]
+        file.add_channel(prefix + topic, about.schema, about.frame_id, columns, metadata)
     for window in rec.windows(topics, start_ns=chosen.start_ns, end_ns=chosen.end_ns):
         for topic, table in window.tables.items():
+            if addresses is not None:
+                table = table.drop(_OWN_CLOCK, strict=False)
             if offset_ns:
-                table = table.with_columns(pl.col("^.*_ns$") + offset_ns)
+                times = [c.name for c in SCHEMAS[rec.channels[topic].schema].columns if c.kind == "time"]
+                moved = {"t_ns", "t_log_ns", *times} - {_OWN_CLOCK}
+                table = table.with_columns(pl.col([c for c in table.columns if c in moved]) + offset_ns)
             if addresses is not None and rec.channels[topic].schema in _RADIO:
                 for mac in table["mac"].unique(maintain_order=True).to_list():
                     addresses.setdefault(
