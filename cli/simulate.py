@@ -37,7 +37,7 @@ def simulate(
     Parameters
     ----------
     scenario : str
-        rectangle, straight, figure-eight, stairs, ramp or still; of legs: walking, sit-to-stand or squats;
+        rectangle, straight, figure-eight, stairs, ramp, lift or still; of legs: walking, sit-to-stand or squats;
         of a phone: phone-10m, phone-50m, phone-100m, phone-turns, phone-loop, phone-city, phone-floors,
         phone-rest, phone-handled; of a phone among anchors: floor-walk, floor-loop, floor-points,
         floor-survey.

@@ -239,12 +239,7 @@ def tracks(cells: Sequence[StudyCell], config: cfg.StudyConfig) -> Figure | None
     rows, columns = (filters, configurations) if across else (configurations, filters)
     figure = Figure(figsize=(0.8 + 2.4 * len(columns), 0.9 + 2.4 * len(rows)))
     axes = figure.subplots(len(rows), len(columns), squeeze=False, sharex=True, sharey=True)
-    points = np.concatenate([cell.positions[:, :2] for own in drawn.values() for cell in own])
-    points = points[~np.isnan(points).any(axis=1)]
-    # A diverged track must not shrink all the others to a dot.
-    low, high = np.percentile(points, (1, 99), axis=0)
-    reach = 0.62 * max(float((high - low).max()), 0.5)
-    middle = (low + high) / 2
+    middle, reach = _frame([cell for own in drawn.values() for cell in own])
     for i, row in enumerate(rows):
         for k, column in enumerate(columns):
             name, configuration = (row, column) if across else (column, row)
@@ -259,6 +254,78 @@ def tracks(cells: Sequence[StudyCell], config: cfg.StudyConfig) -> Figure | None
     axes[0, 0].set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[1] - reach, middle[1] + reach))
     figure.suptitle("Tracks from above")
     return figure
+
+
+def level_boxes(frame: pl.DataFrame, config: cfg.StudyConfig, factor: str) -> Figure:
+    """Every metric of one filter, a panel each: by configuration, and by level of ``factor`` within each.
+
+    With one configuration it is figure 36 of the foot dissertation (two detectors).
+    """
+    levels = order(frame, config)
+    names, configurations = levels[factor], levels["configuration"]
+    metrics = frame["metric"].unique(maintain_order=True).to_list()
+    columns = min(2, len(metrics))
+    rows = -(-len(metrics) // columns)
+    inches = max(2.6, 0.45 * len(names) * len(configurations))
+    figure = Figure(figsize=(0.8 + (0.9 + inches) * columns, 1.2 + 2.6 * rows))
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    width = 0.8 / len(names)
+    for ax, metric in zip(axes, metrics, strict=False):
+        own = frame.filter(metric=metric)
+        for i, configuration in enumerate(configurations):
+            samples = _samples(own.filter(configuration=configuration), factor, names)
+            numbers = [names.index(s) for s in samples]
+            positions = [i - 0.4 + width * (k + 0.5) for k in numbers]
+            _box(ax, samples, [colour(k) for k in numbers], positions, 0.8 * width)
+        _name_ticks(ax, configurations, inches)
+        ax.set_xlim(-0.5, len(configurations) - 0.5)
+        ax.grid(axis="x", visible=False)
+        ax.set_ylabel(_axis_label(own))
+        _scale(ax, own, False)
+    for ax in axes[len(metrics) :]:
+        ax.set_axis_off()
+    handles: list[Any] = [Patch(facecolor=colour(k), alpha=0.65, label=name) for k, name in enumerate(names)]
+    handles.append(
+        Line2D([], [], marker="D", linestyle="", markerfacecolor="white", color="black", label="mean")
+    )
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(6, len(handles)), frameon=False)
+    figure.suptitle(f"{frame['filter'][0]}: each metric by {factor}")
+    return figure
+
+
+def level_tracks(cells: Sequence[StudyCell], config: cfg.StudyConfig, factor: str) -> Figure | None:
+    """Overlaid tracks of one filter, a row a configuration, a column a level of ``factor`` (figure 35)."""
+    known = [c for c in cells if c.status == "ok" and len(c.positions) > 1]
+    if not known:
+        return None
+    names = dict.fromkeys(m.levels[factor] for m in cfg.methods(config))
+    names = [n for n in names if any(c.levels[factor] == n for c in known)]
+    rows = sorted({c.configuration for c in known})
+    figure = Figure(figsize=(0.8 + 3.2 * len(names), 0.9 + 3.2 * len(rows)))
+    axes = figure.subplots(len(rows), len(names), squeeze=False)
+    for i, row in enumerate(rows):
+        own = [c for c in known if c.configuration == row]
+        middle, reach = _frame(own)  # a walk of 300 m needs another frame than one of 10 m
+        for k, name in enumerate(names):
+            ax = axes[i, k]
+            _overlay(ax, [c for c in own if c.levels[factor] == name], colour(k), middle, reach)
+            ax.set(xlim=(middle[0] - reach, middle[0] + reach), ylim=(middle[1] - reach, middle[1] + reach))
+            if i == 0:
+                ax.set_title(name)
+            if k == 0:
+                ax.set_ylabel(f"{row}\ny (m)")
+            if i == len(rows) - 1:
+                ax.set_xlabel("x (m)")
+    figure.suptitle(f"{known[0].label}: tracks from above by {factor}")
+    return figure
+
+
+def _frame(cells: Sequence[StudyCell]) -> tuple[np.ndarray, float]:
+    """Return middle and half width of a frame in which a diverged track does not shrink all others to a dot."""
+    points = np.concatenate([cell.positions[:, :2] for cell in cells])
+    points = points[~np.isnan(points).any(axis=1)]
+    low, high = np.percentile(points, (1, 99), axis=0)
+    return (low + high) / 2, 0.62 * max(float((high - low).max()), 0.5)
 
 
 WALKS_A_PANEL = 6

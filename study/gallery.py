@@ -79,11 +79,55 @@ def drawings(
         if any(c.clipped for c in own):
             caption += " Dashed: clipped input."
         drawn.append(Drawing("tracks", "tracks", caption, "tracks", (own, config)))
+    drawn += _levels(frame, cells, config)
     drawn += _walk_by_walk(own, config)
     single = nees.filter(pl.col("configuration") != "", *at_base(base))
     if len(single):
         caption = f"Mean NEES over the walks{fixed}; above the band a filter is too sure of itself."
         drawn.append(Drawing("consistency", "consistency", caption, "consistency", (single, config)))
+    return drawn
+
+
+def _levels(frame: pl.DataFrame, cells: Sequence[StudyCell], config: cfg.StudyConfig) -> list[Drawing]:
+    """Return figures of the levels of a factor against each other, where one filter is held fixed.
+
+    That is where a published table does so (filter, levels and configurations are the table's), or where the study
+    has one filter only.
+    """
+    labels = {m.label for m in cfg.methods(config)}
+    chosen: dict[tuple[str, str], tuple[list[str], list[str]]] = {}
+    for table in config.published:
+        if table.by != "estimator" and table.estimator in labels:
+            columns = list(dict.fromkeys(c for row in table.rows.values() for c in row))
+            chosen.setdefault((table.estimator, table.by), (list(table.rows), columns))
+    if not chosen and len(labels) == 1:
+        names = frame["configuration"].unique().to_list()
+        for factor in cfg.factor_names(config):
+            chosen[next(iter(labels)), factor] = (frame[factor].unique().to_list(), names)
+    drawn: list[Drawing] = []
+    for (label, factor), (levels, configurations) in chosen.items():
+        part = frame.filter(
+            pl.col("filter") == label,
+            pl.col(factor).is_in(levels),
+            pl.col("configuration").is_in(configurations),
+            pl.col("value").is_finite(),
+        )
+        if part[factor].n_unique() < 2:
+            continue
+        own = [
+            c
+            for c in cells
+            if c.label == label and c.levels[factor] in levels and c.configuration in configurations
+        ]
+        stem = re.sub(r"[^a-z0-9]+", "-", f"{factor}-{label}".lower()).strip("-")
+        at = f"{label}, {', '.join(sorted(configurations))}"
+        caption = f"{at}: every metric by {factor} (mean: diamond; below 20 values every value)."
+        drawn.append(Drawing(f"levels-{stem}", "box", caption, "level_boxes", (part, config, factor)))
+        if config.tracks and own:
+            caption = f"{at}: tracks by {factor}, start at the cross, dots where they end."
+            drawn.append(
+                Drawing(f"level-tracks-{stem}", "tracks", caption, "level_tracks", (own, config, factor))
+            )
     return drawn
 
 

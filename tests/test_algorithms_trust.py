@@ -105,3 +105,55 @@ def test_real_walks_and_runs_with_one_setting(data_dir: Any) -> None:
     assert errors["2017-11-22-11-25-20"] < 0.09
     assert errors["2017-11-27-11-25-12"] < 0.2
     assert errors["2017-12-15-18-02-28"] < 0.2
+
+
+def remark(estimator: Any, kind: str) -> Any:
+    return next((r for r in estimator.remarks() if r.kind == kind), None)
+
+
+def test_a_good_walk_has_nothing_against_it() -> None:
+    for gait in ("walk", "fast", "run"):
+        rows, walk = simulated(gait=gait, rate_hz=200.0, length_m=60.0)
+        _, estimator = run("foot.15iez-zaru", rows, rate_hz=200.0)
+        doubts = {"steps_against_swings", "path_against_steps", "bias_moved", "unsure", "clipped"}
+        assert not kinds(estimator) & doubts, gait
+        assert 0.9 < estimator.record.verdict.swings / walk.steps.height < 1.4, (
+            gait
+        )  # a slow swing turns twice
+
+
+def test_swings_are_counted_without_a_stance_detector() -> None:
+    """A detector that joins strides makes fewer steps than the foot has swung."""
+    rows, walk = simulated(laps=2)
+    _, estimator = run("foot.9iez", rows, preset="published", step_min_m=3.0)
+    assert 0.9 < estimator.record.verdict.swings / walk.steps.height < 1.4
+    assert remark(estimator, "steps_against_swings")
+
+
+def test_a_way_without_steps_is_fatal() -> None:
+    rows, _ = simulated(laps=2)
+    _, estimator = run("foot.9iez", rows, step_min_m=50.0)
+    assert remark(estimator, "path_against_steps").fatal
+
+
+def test_a_lost_angle_taken_for_bias_is_fatal() -> None:
+    """A gyroscope that stops at 250 °/s: fifteen states find a bias that no rest showed, nine know of none."""
+    rows, _ = simulated(laps=2, config="3030")
+    _, fifteen = run("foot.15iez-zaru", rows)
+    assert remark(fifteen, "clipped")
+    assert remark(fifteen, "inconsistent")
+    assert remark(fifteen, "bias_moved").fatal
+    assert not remark(run("foot.9iez", rows)[1], "bias_moved")
+
+
+def test_the_innovations_tell_of_a_wrong_scale() -> None:
+    rows, _ = simulated(laps=2)
+    assert not remark(run("foot.9iez", rows)[1], "inconsistent")
+    rows[:, 4:7] *= 1.1
+    assert remark(run("foot.9iez", rows)[1], "inconsistent")
+
+
+def test_a_walk_without_a_rest_says_how_unsure_it_is() -> None:
+    rows, _ = simulated(rest_s=0.0, laps=8)
+    _, estimator = run("foot.9iez", rows)
+    assert remark(estimator, "unsure")

@@ -84,3 +84,21 @@ def test_a_ramp_is_climbed_and_left() -> None:
 def test_minutes_of_walking_are_written(tmp_path: Path) -> None:
     written = sim.simulate("figure-eight", tmp_path, seed=1, duration_s=180.0, errors="unkind", gait="fast")
     assert all(p.exists() for p in written.paths)
+
+
+def test_a_lift_carries_a_standing_foot() -> None:
+    """Truth and readings agree with each other: a ride is not still, and ‖f‖ tells of it."""
+    walk = sim.walk("lift", seed=4, ride_m=3.3, ride_s=7.0, imu1=sim.IDEAL)
+    assert walk.closed
+    assert np.abs(walk.pos[-1] - walk.pos[0]).max() < 1e-6
+    upstairs = np.median(walk.pos[walk.still & (np.abs(walk.pos[:, 2]) > 1.0), 2])
+    assert upstairs == pytest.approx(3.3, abs=1e-3)
+    assert np.abs(walk.vel[walk.still]).max() < 1e-9
+    riding = ~walk.still & (np.abs(walk.gyr_b).max(axis=1) < 1e-12)
+    assert riding.sum() / 100.0 == pytest.approx(14.0, abs=0.1)
+    norm = np.linalg.norm(walk.acc_b[riding], axis=1)
+    assert np.abs(norm - 9.81).max() == pytest.approx(
+        7.513 * 3.3 / 7.0**2, rel=0.01
+    )  # of the step of degree 7
+    climbed = np.concatenate(([0.0], np.cumsum(0.5 * np.diff(walk.t) * (walk.vel[1:, 2] + walk.vel[:-1, 2]))))
+    assert np.abs(climbed - (walk.pos[:, 2] - walk.pos[0, 2])).max() < 0.01

@@ -96,7 +96,7 @@ def _tab(name: str, canvases: Sequence[Canvas], entries: Sequence[Entry]) -> rrb
     spatial = _panels([e for e in mine if e.kind in SPATIAL], canvases)
     over_time = [e for e in mine if e.kind not in SPATIAL]
     if name == OVERVIEW:
-        order = {HEIGHT: 0, "lanes": 1}
+        order = {"verdict": -1, HEIGHT: 0, "lanes": 1}
         over_time.sort(key=lambda e: order.get(e.panel, 2))
     if not (spatial or over_time):
         return None

@@ -43,6 +43,7 @@ def report(rec: Recording, metrics: Evaluation | str | None = None) -> str:
         metrics = measured(rec)
     runs = {n.removeprefix("run/"): m for n, m in rec.metadata.items() if n.startswith("run/")}
     parts = [f"# {printable(rec.path.name)}", "", f"{rec.duration_s:.2f} s, {len(rec.channels)} channels", ""]
+    parts += verdicts(runs)
     if isinstance(metrics, str):
         parts += ["## Metrics", "", f"Not measured: {metrics}", ""] if metrics else []
     else:
@@ -65,6 +66,24 @@ def report(rec: Recording, metrics: Evaluation | str | None = None) -> str:
                 *_table(["what", "value"], [[k, v] for k, v in record.items()]),
             ]
     return "\n".join(parts)
+
+
+def verdicts(runs: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """Return what must be known before any number is read: runs whose results must not be used, and doubts.
+
+    Parameters
+    ----------
+    runs : mapping
+        Lineage by run.
+    """
+    parts: list[str] = []
+    for run, lineage in runs.items():
+        kinds = list(dict.fromkeys(kind for kind, _, _ in json.loads(lineage.get("findings", "[]"))))
+        if lineage.get("fatal") == "true":
+            parts.append(f"- **{printable(run)}: results must not be used** ({', '.join(kinds)})")
+        elif kinds:
+            parts.append(f"- {printable(run)}: {', '.join(kinds)}")
+    return ["## Verdict", "", *parts, "", "Details below, under findings.", ""] if parts else []
 
 
 def replay_report(result: ReplayResult) -> str:

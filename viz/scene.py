@@ -19,11 +19,13 @@ from .annotation_lanes import AnnotationLanes
 from .canvas import (
     ALIGNMENT,
     COMPARE,
+    OVERVIEW,
     REPORT,
     Canvas,
     ChannelLike,
 )
 from .registry import views_of, warn
+from .report import verdicts
 from .timeaxis import TimeAxis
 from .trace import axes_error, compared, distance
 from .views.base import View
@@ -75,6 +77,15 @@ class Scene:
         draw_plan(canvas)
         for view in self._all():
             self._do(view, View.begin.__name__)
+        unusable = {
+            name.removeprefix("run/"): lineage
+            for name, lineage in canvas.metadata.items()
+            if name.startswith("run/") and lineage.get("fatal") == "true"
+        }
+        if unusable:  # in front of the pictures, which look right
+            path, text = f"{canvas.prefix}/verdict", "\n".join(verdicts(unusable))
+            canvas.static(path, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+            canvas.show("document", path, tab=OVERVIEW, panel="verdict", owner=canvas.prefix[1:])
         title = canvas.prefix[1:] or "report"
         canvas.show("document", f"{canvas.prefix}/report", tab=REPORT, panel=title, owner=canvas.prefix[1:])
 

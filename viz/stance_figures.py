@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -52,7 +53,9 @@ def conditions(rec: Recording, fig: Figure) -> None:
             f"{rec.path}: nothing for this figure: no stance detector; replay a foot estimator first"
         )
     tables = {name: (rec.table(values), rec.table(stance)) for name, (values, stance) in runs.items()}
-    heights = [h for values, _ in tables.values() for h in [*([1.0] * len(_statistics(values))), 1.5]]
+    heights = [
+        h for values, _ in tables.values() for h in [*([1.0] * len(statistics_of(values.columns))), 1.5]
+    ]
     fig.set_size_inches(10.0, 1.0 + 1.7 * sum(heights))
     panels = iter(fig.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0])
     for name, (values, stance) in tables.items():
@@ -62,8 +65,38 @@ def conditions(rec: Recording, fig: Figure) -> None:
         )
 
 
-def _statistics(values: pl.DataFrame) -> list[str]:
-    return [c for c in values.columns if c not in ("t_ns", "threshold", "still")]
+def statistics_of(columns: Sequence[str]) -> list[str]:
+    """Return which columns of a stance detector's output are statistics with a condition each."""
+    return [c for c in columns if c not in ("t_ns", "threshold", "still")]
+
+
+def condition(statistic: str, values: pl.DataFrame, metadata: Mapping[str, str]) -> Bools:
+    """Return where a detector's condition on one statistic is met.
+
+    Parameters
+    ----------
+    statistic : str
+        Column of ``values``.
+    values : polars.DataFrame
+        Rows of a channel ``detector``; a column ``threshold`` is a limit that follows the gait.
+    metadata : mapping
+        The channel's: ``threshold.<statistic>``, and ``.min`` for a floor.
+
+    Returns
+    -------
+    ndarray of bool, shape (n,)
+        False where the statistic is not known.
+    """
+    x = values[statistic].to_numpy()
+    if "threshold" in values.columns:
+        return x < values["threshold"].to_numpy()
+    low, high = (_number(metadata, f"threshold.{statistic}{end}") for end in (".min", ""))
+    met = np.isfinite(x)
+    if low is not None:
+        met &= x > low
+    if high is not None:
+        met &= x < high
+    return met
 
 
 def _detector(
@@ -83,10 +116,9 @@ def _detector(
     shown = (t >= begin) & (t <= begin + SHOWN_S)
     t, still, both = t[shown], still[shown], both.filter(pl.Series(shown))
     lanes: list[tuple[str, Bools]] = []
-    for statistic in _statistics(both):
+    for statistic in statistics_of(both.columns):
         ax = next(panels)
         x = both[statistic].to_numpy()
-        met = np.ones(len(x), bool)
         ax.plot(t, x, color=style.NORM, linewidth=0.9, label=statistic)
         low, high = (_number(metadata, f"threshold.{statistic}{end}") for end in (".min", ""))
         if "threshold" in both.columns:
@@ -99,9 +131,8 @@ def _detector(
                 linestyle="--",
                 label="threshold, follows the gait",
             )
-            met = x < limit
             ax.set_yscale("log")
-        for limit, label, keep in ((low, "above", x > (low or 0.0)), (high, "below", x < (high or 0.0))):
+        for limit, label in ((low, "above"), (high, "below")):
             if limit is not None:
                 ax.axhline(
                     limit,
@@ -110,12 +141,11 @@ def _detector(
                     linestyle="--",
                     label=f"still {label} {limit:g}",
                 )
-                met &= keep
         if high is not None and "threshold" not in both.columns:
             ax.set_ylim(min(0.0, float(np.nanmin(x))), max(4.0 * high if low is None else 2.5 * high, 1e-9))
         _boxes(ax, t, still)
         _dress(ax, f"{run}: {statistic} (detector {name}); grey: stance", UNITS.get(statistic, ""))
-        lanes.append((statistic, met))
+        lanes.append((statistic, condition(statistic, both, metadata)))
     every = np.logical_and.reduce([met for _, met in lanes])
     lanes += [("all of them", every)] if len(lanes) > 1 else []
     lanes.append(("cleaned: still", still))
@@ -129,7 +159,7 @@ def _detector(
     ax.set_xlabel("time since the start (s)", fontsize=9)
 
 
-def _number(metadata: dict[str, str], key: str) -> float | None:
+def _number(metadata: Mapping[str, str], key: str) -> float | None:
     return float(metadata[key]) if key in metadata else None
 
 

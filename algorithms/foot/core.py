@@ -35,6 +35,12 @@ STEPS = record_type(
 LONGEST_SWING_S = 5.0
 """s: who moves for longer without a stance has lost them."""
 LONGEST_STRIDE_M = 4.0
+TURN_S, GAIT_S = 0.1, 1.0
+"""s: averages of ‖ω‖ that show a swing, and what is usual in this gait."""
+LEAST_TURNING = 0.5
+"""rad/s: below this a foot does not walk."""
+SURPRISE = 16.27
+"""99.9 % of a chi-square with three degrees of freedom."""
 
 VERDICT = record_type(
     ("fastest", "f8"),  # m/s
@@ -43,6 +49,16 @@ VERDICT = record_type(
     ("n_landings", "i8"),
     ("navigated_s", "f8"),
     ("lost_s", "f8"),  # time in swings beyond LONGEST_SWING_S
+    ("path_m", "f8"),  # way of the track
+    ("steps_m", "f8"),  # sum of the steps
+    ("turning", "f8"),  # rad/s, ‖ω‖ averaged over TURN_S
+    ("usual_turning", "f8"),  # the same over GAIT_S
+    ("swings", "i8"),  # times that the foot turned, by the gyroscope alone
+    ("is_turning", "?"),
+    ("n_judged", "i8"),  # stances whose velocity was compared with what P expects
+    ("n_surprising", "i8"),  # those outside the 99.9 % ellipsoid
+    ("first_bias", "f8", (3,)),  # rad/s, of the gyroscope at the start
+    ("unsure_m", "f8"),  # the horizontal position's own standard deviation, at the newest sample
     ("at_lowest", "i8", (6,)),  # samples at the lowest value of each column
     ("at_highest", "i8", (6,)),
 )
@@ -172,6 +188,8 @@ def starts(s: Any) -> bool:
     if s.started or s.rest.index < 0 or s.released - 1 != s.rest.index:
         return False
     rest.start(s)
+    for i in range(3):
+        s.verdict.first_bias[i] = s.bias_gyr[i]
     s.started = True
     s.steps.was_still = True
     return True
@@ -211,8 +229,43 @@ def _note_verdict(s: Any, r: Any) -> None:
     speed = s.vel[0] * s.vel[0] + s.vel[1] * s.vel[1] + s.vel[2] * s.vel[2]
     if speed > v.fastest * v.fastest:
         v.fastest = math.sqrt(speed)
+    v.path_m += math.sqrt(speed) * r.dt
     if s.steps.swing > LONGEST_SWING_S:
         v.lost_s += r.dt
+    _count_swings(v, r)
+
+
+@inlined
+def _count_swings(v: Any, r: Any) -> None:
+    """Count swings by the gyroscope alone: ‖ω‖ rises above what is usual in this gait, and falls below it again.
+
+    It knows of no stance detector, so it can tell when one is wrong.
+    """
+    v.turning += (r.gyr_norm - v.turning) * min(1.0, r.dt / TURN_S)
+    v.usual_turning += (r.gyr_norm - v.usual_turning) * min(1.0, r.dt / GAIT_S)
+    if v.is_turning:
+        v.is_turning = v.turning > 0.7 * v.usual_turning
+    elif v.turning > max(1.2 * v.usual_turning, LEAST_TURNING):
+        v.is_turning = True
+        v.swings += 1
+
+
+@inlined
+def judge_innovation(s: Any, r: Any, vel: int, variance: float) -> None:
+    """Compare the velocity at the first sample of a stance with what P and R (``variance``) expect.
+
+    Call it before the update. ``vel`` is the first error state of the velocity, ``s.stance_vel`` what the standing
+    foot's is taken for.
+    """
+    if s.stance_s > r.dt:
+        return
+    square = 0.0
+    for i in range(3):
+        error = s.vel[i] - s.stance_vel[i]
+        square += error * error / (s.P[vel + i, vel + i] + variance)
+    s.verdict.n_judged += 1
+    if square > SURPRISE:
+        s.verdict.n_surprising += 1
 
 
 @compiled
@@ -233,6 +286,7 @@ def _land(s: Any, out: FloatArray) -> None:
     out[STEP + 3] = z
     out[STEP + 4] = math.atan2(y, x)
     steps.count += 1
+    verdict.steps_m += length
     for i in range(3):
         steps.landing[i] = pos[i]
         s.forward[i] += s.rot[0, i] * x + s.rot[1, i] * y
@@ -264,6 +318,7 @@ def emit_sigma(s: Any, pos: int, vel: int, att: int, out: FloatArray) -> None:
             out[SIGMA + i] = math.nan
             out[SIGMA + 3 + i] = math.nan
             out[SIGMA + 6 + i] = math.nan
+    s.verdict.unsure_m = math.sqrt(out[SIGMA] * out[SIGMA] + out[SIGMA + 1] * out[SIGMA + 1])
 
 
 @inlined

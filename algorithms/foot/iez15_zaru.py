@@ -101,6 +101,7 @@ def correct(s: Any, r: Any) -> None:
     kalman.clear(s.dx)
     base.rolling_velocity(s, r, s.stance_vel)
     variance = base.stance_variance(s, r.dt)
+    core.judge_innovation(s, r, VEL, variance)
     for i in range(3):
         kalman.update(s, VEL + i, s.vel[i] - s.stance_vel[i], variance, 0)
     if core.at_rest(s, r, s.zaru_after, s.zaru_rate):

@@ -182,6 +182,7 @@ def zero_velocity(s: Any, r: Any, n_considered: int) -> None:
     kalman.clear(s.dx)
     rolling_velocity(s, r, s.stance_vel)
     variance = stance_variance(s, r.dt)
+    core.judge_innovation(s, r, VEL, variance)
     for i in range(3):
         kalman.update(s, VEL + i, s.vel[i] - s.stance_vel[i], variance, n_considered)
     feed_back(s, n_considered)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..contract import Remark
+from .rest import BIAS_CHANGE
 
 IMU_COLUMNS = ("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z")
 RESTLESS = 0.03
@@ -172,6 +173,19 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
 FASTEST = 15.0
 """m/s: no foot swings faster, sprinters' apart."""
 CLIPPED_SAMPLES = 5
+LEAST_JUDGED = 10
+"""Strides or stances, fewer of which prove nothing."""
+SURPRISING = 0.3
+"""Share of the stances outside what the filter expects of 999 in 1000 (good walks: below 0.2)."""
+FEWEST_STEPS = 0.7
+"""Steps to one swing, or swings to one step (good walks: above 0.75; a slow swing may turn twice)."""
+WAY_IN_STEPS = 1.5, 4.0
+"""Way of the track to the sum of the steps (walks: 0.9 to 1.3): doubtful from the first on, lost from the second."""
+BIAS_MOVED = 5.0, 10.0
+"""Standard deviations of the rest's bias by which it may move: doubtful, and taken for something else."""
+LEAST_BIAS_MOVED = 0.02
+"""rad/s: no gyroscope's bias moves so far within a walk."""
+UNSURE_M = 1.0
 LEAST_CEILING = (15.0, 15.0, 15.0, 3.0, 3.0, 3.0)
 """m/s², rad/s: the same extreme value many times is a ceiling only beyond what a rest reaches."""
 
@@ -216,14 +230,78 @@ def verdict(s: Any, p: Any) -> list[Remark]:
                 f"{p.detector} breaks its stances; the position between them is doubtful",
             )
         )
+    found += _against_the_gait(s)
+    found += _against_the_filter(s)
+    swing_rows = max(1, s.taken - s.n_still)
     for i, column in enumerate(IMU_COLUMNS):
         for value, count in ((s.lowest[i], v.at_lowest[i]), (s.highest[i], v.at_highest[i])):
             if count >= CLIPPED_SAMPLES and abs(value) > LEAST_CEILING[i]:
                 found.append(
                     Remark(
                         "clipped",
-                        f"{column} stands at its extreme {value:.4g} in {count} rows: the sensor's range is too "
-                        "small for this walk, turns and speeds in the swing are underestimated",
+                        f"{column} stands at its extreme {value:.4g} in {count} rows "
+                        f"({count / swing_rows:.1%} of those in swings): the sensor's range is too small for "
+                        "this walk, turns and speeds in the swing are underestimated",
                     )
                 )
+    return found
+
+
+def _against_the_gait(s: Any) -> list[Remark]:
+    """Return what disagrees between steps, track and the swings that the gyroscope alone counts."""
+    v, steps, found = s.verdict, int(s.steps.count), []
+    if max(steps, v.swings) >= LEAST_JUDGED and min(steps, v.swings) < FEWEST_STEPS * max(steps, v.swings):
+        found.append(
+            Remark(
+                "steps_against_swings",
+                f"{steps} steps were found, but the gyroscope tells of {v.swings} swings: "
+                f"{'stances were missed' if steps < v.swings else 'a stride was cut in pieces, or this is no walk'}",
+            )
+        )
+    way = v.path_m / v.steps_m if v.steps_m > 0.0 else math.inf
+    if v.path_m > 10.0 and way > WAY_IN_STEPS[0]:
+        found.append(
+            Remark(
+                "path_against_steps",
+                f"the track is {v.path_m:.1f} m long, the steps together {v.steps_m:.1f} m: it moves between the steps",
+                fatal=bool(way > WAY_IN_STEPS[1]),
+            )
+        )
+    return found
+
+
+def _against_the_filter(s: Any) -> list[Remark]:
+    """Return where the filter contradicts itself: innovations, bias, its own standard deviation."""
+    v, found = s.verdict, []
+    share = v.n_surprising / max(1, v.n_judged)
+    if v.n_judged >= LEAST_JUDGED and share > SURPRISING:
+        found.append(
+            Remark(
+                "inconsistent",
+                f"in {v.n_surprising} of {v.n_judged} stances the velocity is farther from zero than the filter "
+                f"expects of 999 in 1000: errors that it does not know of (scale, range, stances), and its standard "
+                f"deviations are too small",
+            )
+        )
+    moved = max(abs(s.bias_gyr[i] - v.first_bias[i]) for i in range(3))
+    known = math.sqrt(max(s.rest.bias_variance, BIAS_CHANGE * BIAS_CHANGE))
+    if moved > BIAS_MOVED[0] * known:
+        # A rest of a fixed length does not say how well it knows the bias.
+        fatal = s.rest.adaptive and moved > max(BIAS_MOVED[1] * known, LEAST_BIAS_MOVED)
+        found.append(
+            Remark(
+                "bias_moved",
+                f"the gyroscope's bias moved by {moved:.4f} rad/s, {moved / known:.0f} times what the rest leaves "
+                f"open: other errors (scale, a range too small) are taken for it; foot.9iez estimates none",
+                fatal=bool(fatal),
+            )
+        )
+    if v.unsure_m > UNSURE_M:
+        found.append(
+            Remark(
+                "unsure",
+                f"the filter's own standard deviation of the horizontal position is {v.unsure_m:.1f} m at the end: "
+                f"the rest says too little about the gyroscope's bias; stand still for longer",
+            )
+        )
     return found

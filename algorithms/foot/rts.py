@@ -61,6 +61,7 @@ def _correct(s: Any, r: Any, log: Any) -> None:
     kalman.clear(s.dx)
     rolling_velocity(s, r, s.stance_vel)
     variance = stance_variance(s, r.dt)
+    core.judge_innovation(s, r, VEL, variance)
     for i in range(3):
         _update(s, log, VEL + i, s.vel[i] - s.stance_vel[i], variance)
     if core.at_rest(s, r, s.zaru_after, s.zaru_rate):

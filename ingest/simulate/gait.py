@@ -32,6 +32,9 @@ BALL = np.array([0.12, 0.0, -0.08])
 HEEL = np.array([-0.14, 0.0, -0.08])
 """Heel against the box, in f (m): the foot rolls about it after heel strike."""
 
+DOORS_S = 1.0
+"""s that the foot stands in the lift before and after it moves."""
+
 STANCE_SHARE = 0.31
 """Share of a walking stride that the foot stands."""
 
@@ -107,7 +110,7 @@ class Motion:
     acc_b, gyr_b : ndarray
         Ideal specific force (m/s²) and angular rate (rad/s) in b, shape (n, 3).
     still : ndarray
-        Whether the foot stands, shape (n,), bool.
+        Whether the foot stands on ground that does not move, shape (n,), bool.
     """
 
     t: FloatArray
@@ -132,13 +135,24 @@ class GaitModel:
         Rest before the first and after the last stride (s).
     gravity : float
         Local gravity (m/s²).
+    rides : ndarray, optional
+        Climb of the lift in which the foot stands after each stride (m, 0: none), shape (m,).
+    ride_s : float
+        Time of a ride (s).
     """
 
     SHARES = (0.14, 0.46, 0.09)
     """Heel-off, swing and slap as shares of the stride; the rest of it the foot stands."""
 
     def __init__(
-        self, footfalls: FloatArray, durations: FloatArray, rest_s: float, gravity: float, style: Style
+        self,
+        footfalls: FloatArray,
+        durations: FloatArray,
+        rest_s: float,
+        gravity: float,
+        style: Style,
+        rides: FloatArray | None = None,
+        ride_s: float = 8.0,
     ) -> None:
         self.footfalls = footfalls
         self.durations = durations
@@ -149,11 +163,21 @@ class GaitModel:
         shares = tuple(stretch * share for share in self.SHARES)
         off, swing, slap = shares if style.heel_toe_roll else (0.0, sum(shares), 0.0)
         self._off, self._swing, self._slap, self._moving = off, swing, slap, off + swing + slap
+        rides = np.zeros(len(durations)) if rides is None else rides
+        waits = np.where(rides != 0.0, ride_s + 2 * DOORS_S, 0.0)
         self.lift_s = (
-            rest_s + np.concatenate(([0.0], np.cumsum(durations)[:-1])) if len(durations) else durations
+            rest_s + np.concatenate(([0.0], np.cumsum(durations + waits)[:-1]))
+            if len(durations)
+            else durations
         )
         self.land_s = self.lift_s + self._moving * durations
-        self.end_s = float(self.land_s[-1] + rest_s) if len(durations) else 2 * rest_s
+        self.end_s = float(self.land_s[-1] + waits[-1] + rest_s) if len(durations) else 2 * rest_s
+        self._rides = [
+            (float(start), float(climb))
+            for start, climb in zip(self.land_s + DOORS_S, rides, strict=True)
+            if climb
+        ]
+        self._ride_s = ride_s
 
     def motion(self, t: FloatArray, mount: Mount) -> Motion:
         """Return what a sensor at ``mount`` does at the times ``t`` (s, ascending)."""
@@ -242,9 +266,14 @@ class GaitModel:
         pivot[0] += begin
         # Not by the sum above but to the bit: a standing foot stands on its footfall.
         pivot[0][standing] = (there[:, :3] + _turn(there[:, 3], ball))[standing]
+        riding = np.zeros(n, bool)
+        for start, climb in self._rides:
+            part = (t - start) / self._ride_s
+            pivot[:, :, 2] += climb * _smooth_step(part, np.full(n, self._ride_s))
+            riding |= (part > 0.0) & (part < 1.0)
         arm = wander[:, :, None] * (ball - heel)
         arm[0] += lever - ball
-        return (u == 0) | standing, (psi, theta, phi), pivot, arm
+        return ((u == 0) | standing) & ~riding, (psi, theta, phi), pivot, arm
 
     def _strike(self, u: FloatArray, strike: float, length: FloatArray) -> _Jet:
         """Return the heel-strike vibration (m) and its derivatives: a sine under a bump of degree 6."""

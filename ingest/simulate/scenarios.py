@@ -26,11 +26,15 @@ class Route:
         Time of each stride (s), shape (m,).
     closed : bool
         Whether the last footfall is where the first was.
+    rides : ndarray
+        Climb of the lift in which the foot stands after each stride (m, 0: none), shape (m,). Footfalls do not
+        count it.
     """
 
     footfalls: FloatArray
     durations: FloatArray
     closed: bool
+    rides: FloatArray
 
 
 class _Vary:
@@ -147,6 +151,29 @@ def _ramp(options: Options, vary: _Vary) -> FloatArray:
     return _polyline(legs, vary)
 
 
+def _lift(options: Options, vary: _Vary) -> FloatArray:
+    """To a lift, up, back on the upper floor, down: closed. Rides are in :func:`_lift_rides`."""
+    across = options.stride_m
+    length = max(across, (options.length_m or 30.0) / 2 - across)
+    turn = -np.pi / 2 if options.clockwise else np.pi / 2
+    count = vary.strides(length)
+    legs = []
+    for k in range(_laps(options, 2 * count + 2)):
+        heading = 4 * k * turn
+        legs += [(heading, length, count, 0.0), (heading + turn, across, 1, 0.0)]
+        legs += [(heading + 2 * turn, length, count, 0.0), (heading + 3 * turn, across, 1, 0.0)]
+    return _polyline(legs, vary)
+
+
+def _lift_rides(options: Options, vary: _Vary, strides: int) -> FloatArray:
+    """Return a ride up in the middle of each round of :func:`_lift`, and one down at its end."""
+    half = vary.strides(max(options.stride_m, (options.length_m or 30.0) / 2 - options.stride_m)) + 1
+    rides = np.zeros(strides)
+    rides[half - 1 :: 2 * half] = options.ride_m
+    rides[2 * half - 1 :: 2 * half] = -options.ride_m
+    return rides
+
+
 def _still(options: Options, vary: _Vary) -> FloatArray:
     del vary
     return np.zeros((1, 4))
@@ -158,6 +185,7 @@ _ROUTES: dict[str, tuple[str, Callable[[Options, _Vary], FloatArray]]] = {
     "figure-eight": ("two touching circles, closed, 25 m a lap", _figure_eight),
     "stairs": ("a flight of stairs, up and down again", _stairs),
     "ramp": ("up a ramp and down another, closed, 30 m a lap", _ramp),
+    "lift": ("to a lift, up, back on the upper floor, down again, closed, 30 m a lap", _lift),
     "still": ("a recording that never moves", _still),
 }
 
@@ -170,4 +198,6 @@ def route(scenario: str, options: Options, rng: np.random.Generator) -> Route:
     vary = _Vary(options, rng)
     footfalls = _ROUTES[scenario][1](options, vary)
     closed = bool(np.linalg.norm(footfalls[-1, :3] - footfalls[0, :3]) < 1e-6)
-    return Route(footfalls, vary.times(len(footfalls) - 1), closed)
+    strides = len(footfalls) - 1
+    rides = _lift_rides(options, vary, strides) if scenario == "lift" else np.zeros(strides)
+    return Route(footfalls, vary.times(strides), closed, rides)

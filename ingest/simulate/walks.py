@@ -94,6 +94,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         given.
     slope : float
         Ramp: rise over run.
+    ride_m, ride_s : float
+        Lift: climb of a ride (m) and its time (s).
     imu1, imu2 : ImuErrors or None
         Errors of the sensors.
     mount1, mount2 : Mount
@@ -125,6 +127,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
     errors: Literal["mpu6050", "unkind", "none"] = "mpu6050"
     gait: Literal["walk", "fast", "run"] = "walk"
     slope: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = 0.08
+    ride_m: _Positive = 3.0
+    ride_s: _Positive = 8.0
     imu1: ImuErrors | None = None
     imu2: ImuErrors | None = None
     mount1: Mount = Mount(roll_deg=6.9, pitch_deg=24.1)
@@ -302,7 +306,8 @@ class Simulation:
         rest = o.rest_s
         if self.scenario == "still":
             rest = (o.duration_s or 30.0) / 2
-        return GaitModel(self.route.footfalls, self.route.durations, rest, o.gravity, o.style)
+        walked = self.route
+        return GaitModel(walked.footfalls, walked.durations, rest, o.gravity, o.style, walked.rides, o.ride_s)
 
     @property
     def length_m(self) -> float:

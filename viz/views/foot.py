@@ -9,7 +9,18 @@ import polars as pl
 import rerun as rr
 
 from .. import style
-from ..canvas import COMPARE, DETECTOR, OVERVIEW, REPORT, SPACE, Times, columns_of
+from ..canvas import (
+    COMPARE,
+    DETECTOR,
+    OVERVIEW,
+    REPORT,
+    SPACE,
+    ChannelLike,
+    Times,
+    columns_of,
+    entity,
+)
+from ..stance_figures import condition, statistics_of
 from .base import View
 from .common import norm_panel
 from .lanes import Lane
@@ -38,6 +49,37 @@ class Stance(View):
 
     def end(self) -> None:
         self.lane.end()
+
+
+class Conditions(View):
+    """How a stance detector decides: a lane a condition that tells met from not met, beside its statistics."""
+
+    title = "stance detector: a lane a condition, met or not"
+    schemas = ("marcha_msgs/msg/NamedValues",)
+    roles = ("estimate",)
+    beside = True
+
+    @classmethod
+    def fits(cls, channel: ChannelLike) -> bool:
+        return super().fits(channel) and "detector" in channel.metadata
+
+    def begin(self) -> None:
+        colors = {"met": style.STILL, "not met": style.MOVING}
+        self.lanes = {}
+        for statistic in statistics_of(self.channel.columns):
+            path = f"{self.path}/condition/{entity(statistic)}"
+            self.lanes[statistic] = Lane(self.canvas, path, colors, hidden=["not met"])
+            self.canvas.show("lanes", path, tab=DETECTOR, panel="lanes", owner=self.owner)
+
+    def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
+        for statistic, lane in self.lanes.items():
+            met = condition(statistic, block, self.channel.metadata)
+            known = np.isfinite(block[statistic].cast(pl.Float64).to_numpy())
+            lane.add(t_ns, np.where(known, met, 2).astype(np.int64), ("not met", "met", ""))
+
+    def end(self) -> None:
+        for lane in self.lanes.values():
+            lane.end()
 
 
 class Steps(View):
