@@ -6,10 +6,10 @@ import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import polars as pl
 
 from ..recording.errors import MarchaError
@@ -24,6 +24,7 @@ PREAMBLE_LINES = 200
 MISSING = ("", "-", "nan", "na", "null", "none", "inf", "-inf")
 """Cells (lower case) that say that there is no value."""
 _MISSING_AS_WRITTEN = ("", "-", "nan", "NaN", "NA", "null", "NULL", "None", "inf", "-inf")
+_LINE_END = re.compile(r"\r\n|\n|\r")
 _COMMA = re.compile(r"^[+-]?\d+,\d+([eE][+-]?\d+)?$")
 _POINT = re.compile(r"^[+-]?\d*\.\d+([eE][+-]?\d+)?$")
 
@@ -57,13 +58,22 @@ def find_header(head: bytes, accept: Callable[[Sequence[str]], bool]) -> Header 
     accept : callable
         Gets the stripped cells of a line.
     """
-    text = head.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "replace")
-    for number, line in enumerate(re.split(r"\r\n|\n|\r", text)[:PREAMBLE_LINES], 1):
-        for separator in (",", ";", "\t"):
-            cells = [c.strip().strip('"') for c in line.split(separator)]
-            if len(cells) > 1 and accept(cells):
-                return Header(number, tuple(cells), separator)
+    for number, separator, cells in _rows_of_cells(head):
+        if accept(cells):
+            return Header(number, cells, separator)
     return None
+
+
+@lru_cache(maxsize=8)
+def _rows_of_cells(head: bytes) -> tuple[tuple[int, str, tuple[str, ...]], ...]:
+    """Return line, separator and cells of what may be a header; kept, because many formats ask of one file."""
+    text = head.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "replace")
+    return tuple(
+        (number, separator, tuple(c.strip().strip('"') for c in line.split(separator)))
+        for number, line in enumerate(_LINE_END.split(text, PREAMBLE_LINES)[:PREAMBLE_LINES], 1)
+        for separator in (",", ";", "\t")
+        if separator in line
+    )
 
 
 def require_header(path: Path, accept: Callable[[Sequence[str]], bool], wanted: str) -> Header:
@@ -169,7 +179,7 @@ def _plain_block(
 ) -> pl.DataFrame | None:
     """Return a block in which every line is a row and every cell what it should be; None where one is not."""
     rows = block.count(b"\n") + (not block.endswith(b"\n"))
-    if not block.strip() or block.count(separator.encode()) != rows * (width - 1):
+    if not block or block.isspace() or block.count(separator.encode()) != rows * (width - 1):
         return None
     try:
         frame = pl.read_csv(
@@ -181,18 +191,21 @@ def _plain_block(
         )
     except pl.exceptions.PolarsError:
         return None
-    place = next(c for c, name in names.items() if name == required)
-    if frame.height != rows or frame[place].null_count():
+    if frame.height != rows:
         return None
-    out: dict[str, Any] = {"line": np.arange(line, line + rows)}
-    for c, name in names.items():
-        column = frame[c]
-        if kinds[c] == pl.Float64:
-            column = column.fill_null(math.nan)
-            if column.is_infinite().any() or (c == place and column.is_nan().any()):
-                return None
-        out[name] = column
-    return pl.DataFrame(out)
+    place = next(c for c, name in names.items() if name == required)
+    numbers = [c for c in names if kinds[c] == pl.Float64]
+    odd = frame.select(  # all columns at once: each query costs as much as some thousand cells
+        *(pl.col(c).is_infinite().any() for c in numbers),
+        none=pl.col(place).is_null().any(),
+        nan=pl.col(place).is_nan().any() if place in numbers else pl.lit(value=False),
+    )
+    if any(odd.row(0)):
+        return None
+    cells = (
+        (pl.col(c).fill_null(math.nan) if c in numbers else pl.col(c)).alias(n) for c, n in names.items()
+    )
+    return frame.select(pl.int_range(line, line + rows, dtype=pl.Int64).alias("line"), *cells)
 
 
 def careful_block(

@@ -241,17 +241,22 @@ class Stream:
             if table.height and part.fixes:
                 self._fixes[part.topic].append(table)
             elif table.height:
-                yield part.topic, table.drop("line")
+                table.drop_in_place("line")
+                yield part.topic, table
 
     def _table(self, part: StreamChannel, frame: pl.DataFrame) -> pl.DataFrame:
         if callable(part.columns):
-            made = pl.DataFrame({k: pl.Series(k, v, strict=False) for k, v in part.columns(frame).items()})
+            made = (pl.Series(k, v, strict=False) for k, v in part.columns(frame).items())
+            table = pl.DataFrame([frame["t_ns"], frame["line"], *made])
         else:
-            made = frame.select(
-                (pl.col(s.name) if s.factor == 1.0 else pl.col(s.name) * s.factor).alias(c)
-                for c, s in part.columns.items()
+            table = frame.select(
+                "t_ns",
+                "line",
+                *(
+                    (pl.col(s.name) if s.factor == 1.0 else pl.col(s.name) * s.factor).alias(c)
+                    for c, s in part.columns.items()
+                ),
             )
-        table = pl.concat([frame.select("t_ns", "line"), made], how="horizontal")
         table = self._present(part, table)
         if part.held and table.height:
             table = self._fresh(part, table)

@@ -112,8 +112,8 @@ class TimestampRepair:
         """Return the rows that are settled, with ``t_ns`` (Int64, never decreasing) in the place of ``t``."""
         if frame.height:
             frame = self._possible(frame)
-        if frame.height:
-            frame = frame.with_columns(t=pl.Series(self._unwrap(frame)))
+        if frame.height and self._period is not None:
+            frame = frame.with_columns(t=pl.Series(self._unwrap(frame, self._period)))
         if self._held is not None:
             frame, self._held = pl.concat([self._held, frame], rechunk=True), None
         ticks = frame["t"].to_numpy() + self._shift
@@ -130,19 +130,20 @@ class TimestampRepair:
             if self._shift:
                 self._report.repaired += int(np.count_nonzero(frame["t"].to_numpy() != ticks))
             self._last = int(ticks[-1])
-            self._last_row = frame.drop("t", "line").row(-1)
+            self._last_row = _readings(frame[-1:]).row(0)
         if final:
             self._summary()
         self._report.keep(frame.height)
         stamp = pl.Series("t_ns", ticks * self._tick_ns, dtype=pl.Int64)
-        return frame.drop("t").insert_column(0, stamp)
+        return pl.DataFrame([stamp, *(s for s in frame.get_columns() if s.name != "t")])
 
     def _possible(self, frame: pl.DataFrame) -> pl.DataFrame:
         """Return the rows whose time a clock can say: arithmetic on others would wrap."""
         most = MOST_NS // self._tick_ns
-        good = frame["t"].is_between(-most, most).fill_null(False)
-        if good.all():
+        t = frame["t"]
+        if not t.null_count() and -most <= int(t.to_numpy().min()) and int(t.to_numpy().max()) <= most:
             return frame
+        good = t.is_between(-most, most).fill_null(False)
         at = int((~good).arg_true()[0])
         self._report.drop(
             "bad_row",
@@ -180,23 +181,21 @@ class TimestampRepair:
         second = 1_000_000_000 // self._tick_ns
         return max(second, 100 * (self._nominal or 0))
 
-    def _unwrap(self, frame: pl.DataFrame) -> Int64Array:
+    def _unwrap(self, frame: pl.DataFrame, period: int) -> Int64Array:
         raw = frame["t"].to_numpy()
-        if self._period is None:
-            return raw
         steps = np.diff(raw, prepend=raw[0] if self._raw is None else self._raw)
         window = ROLLOVER_S * 1e9 / self._tick_ns
         into = np.concatenate(([self._raw_step], steps[:-1]))  # a damaged number is a leap, a counter creeps
-        wraps = np.flatnonzero((steps < 0) & (steps + self._period < window) & (np.abs(into) < window))
+        wraps = np.flatnonzero((steps < 0) & (steps + period < window) & (np.abs(into) < window))
         self._raw_step = int(steps[-1])
         self._raw = int(raw[-1])
         out = raw + self._turns
         for i in wraps:
-            out[i:] += self._period
-            self._turns += self._period
+            out[i:] += period
+            self._turns += period
             self._report.repair(
                 "counter_rollover",
-                f"{self._subject}the counter wrapped after {raw[i] - steps[i]}: {self._period} ticks added "
+                f"{self._subject}the counter wrapped after {raw[i] - steps[i]}: {period} ticks added "
                 "from here on",
                 line=frame["line"][int(i)],
                 subject=self._subject,
@@ -286,7 +285,7 @@ class TimestampRepair:
         )
         if not same.size:
             return frame, ticks
-        data = frame.drop("t", "line")
+        data = _readings(frame)
         first = same[0] == 0  # its predecessor is in the block before
         at = same[1:] if first else same
         equal = np.zeros(same.size, dtype=bool)
@@ -341,3 +340,8 @@ class TimestampRepair:
 
     def _text(self, ticks: int) -> str:
         return f"{ticks * self._tick_ns / 1e6:g} ms"
+
+
+def _readings(frame: pl.DataFrame) -> pl.DataFrame:
+    """Return what a row says beside its time and place in the file."""
+    return pl.DataFrame([s for s in frame.get_columns() if s.name not in ("t", "line")])

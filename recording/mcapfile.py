@@ -7,6 +7,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -50,6 +51,7 @@ _QUEUE = 8
 """Chunks that may wait for a worker: bounds memory."""
 
 
+@cache
 def library_name() -> str:
     """Return ``marcha <version>``, as recordings name their writer."""
     try:

@@ -204,6 +204,5 @@ def _frames(
         if first and "wall" in known and frame.height:
             device["wall_clock_start"] = f"{frame[known['wall']][0]} (local time of the phone)"
             first = False
-        t = whole_ns(frame[known["ms"]], 1e3)
-        drop = [*(x for x in texts if x in frame.columns), known["ms"]]
-        yield frame.with_columns(t=t).drop(drop)
+        t = whole_ns(frame[known["ms"]], 1e3).alias("t")
+        yield pl.DataFrame([*(s for s in frame.get_columns() if s.name not in (*texts, known["ms"])), t])

@@ -288,7 +288,8 @@ def _frames(file: Path, header: Header, runs: list[_Run], report: ReportBuilder)
     for frame in float_blocks(file, header, time, report):
         seconds = frame[time].to_numpy()
         if not runs:
-            yield frame.with_columns(t=pl.Series(np.round(seconds * 1e9).astype(np.int64))).drop(time)
+            t = pl.Series("t", np.round(seconds * 1e9).astype(np.int64))
+            yield pl.DataFrame([*(s for s in frame.get_columns() if s.name != time), t])
             continue
         starts = np.array([r.start_s for r in runs])
         run = np.maximum(np.searchsorted(starts, seconds, side="right") - 1, 0)
