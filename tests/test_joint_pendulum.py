@@ -35,7 +35,7 @@ def turn_to_sensor(rate: FloatArray, seen: FloatArray) -> Rotation:
 
 @pytest.mark.data
 def test_inclination_of_three_segments_beside_cameras(data_dir: Path, tmp_path: Path) -> None:
-    """The third misses the promised 5°; it keeps it where the cameras' own orientation does not jump (docs/joints.md)."""
+    """The third misses the promised 5°, but not where the cameras' orientation is steady (docs/joints.md)."""
     files = sorted((data_dir / "leg" / "pendulum_optical").glob("*.csv"))
     convert(files, tmp_path / "pendulum.mcap", options={"segments": ",".join(SEGMENTS)})
     rec = mr.open(tmp_path / "pendulum.mcap")
