@@ -183,7 +183,6 @@ def _shift(c: Any, i: int, dx: float, dy: float) -> None:
         elif p[k] > s.high[k]:
             p[k] = max(2.0 * s.high[k] - p[k], s.low[k])
             p[VX + k] = -p[VX + k]
-    p[PATH] += math.sqrt(dx * dx + dy * dy)
 
 
 @compiled
@@ -204,11 +203,14 @@ def _drift(c: Any, t_ns: int) -> None:
         p = c.p[i]
         p[GAIN] += gain * 0.1 * _normal(s) if p[GAIN] != 0.0 else 0.0
         if s.walking == 1:
+            # not part of PATH: the length of a random walk depends on how finely it is cut, and a person who
+            # stands keeps the same shadowing
             _shift(c, i, walk * _normal(s), walk * _normal(s))
         else:
             p[VX] = keep * p[VX] + draw * _normal(s)
             p[VY] = keep * p[VY] + draw * _normal(s)
             _shift(c, i, p[VX] * dt, p[VY] * dt)
+            p[PATH] += math.hypot(p[VX], p[VY]) * dt
 
 
 @compiled
@@ -222,6 +224,7 @@ def _step(c: Any, length: float, heading: float) -> None:
         reach = length * p[SCALE] * (1.0 + s.step_sd * _normal(s))
         angle = heading + p[OFFSET] + s.turn_sd * _normal(s)
         _shift(c, i, reach * math.cos(angle), reach * math.sin(angle))
+        p[PATH] += abs(reach)
 
 
 @compiled
