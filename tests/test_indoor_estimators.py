@@ -112,6 +112,30 @@ def test_the_particle_filter_follows_and_knows_its_error():
     assert (delta < 5.991).mean() > 0.8
 
 
+def test_anchors_go_off_and_on_in_mid_track():
+    """While four of six anchors are silent the error and the stated sigma grow; both come back with them."""
+    path = walk(900)
+    radio = heard(path, 4.0, seed=2)
+    second = radio["t_ns"].to_numpy() / 1e9
+    off = (second >= 30) & (second < 60)
+    gone = set(MACS[2:])
+    silent = radio.filter(~(pl.Series(off) & radio["mac"].is_in(gone)))
+    whole = drive(make("indoor.fused", seed=3), {"radio": {"/r": radio}}, attachments=table())
+    found = drive(make("indoor.fused", seed=3), {"radio": {"/r": silent}}, attachments=table())
+    t = found["position"]["t_ns"].to_numpy() / 1e9
+    wrong = errors(found["position"], path)
+    sd = np.hypot(*found["sigma"].select("sigma_pos_x", "sigma_pos_y").to_numpy().T)
+    during, after = (t >= 40) & (t < 60), (t >= 65) & (t < 88)
+    all_heard = np.hypot(*whole["sigma"].select("sigma_pos_x", "sigma_pos_y").to_numpy().T)
+    all_t = whole["position"]["t_ns"].to_numpy() / 1e9
+    assert (
+        sd[during].mean() > 1.2 * all_heard[(all_t >= 40) & (all_t < 60)].mean()
+    )  # it says that it knows less
+    assert (wrong[during] ** 2 < 5.991 * sd[during] ** 2).mean() > 0.85  # and is right
+    assert wrong[after].mean() < 2.0
+    assert sd[after].mean() < 1.25 * all_heard[(all_t >= 65) & (all_t < 88)].mean()
+
+
 def test_the_particle_filter_gives_the_same_bits_in_blocks_and_after_a_restore():
     path, radio = walk(200), heard(walk(200), 4.0)
     one = make("indoor.fused", particles=50)

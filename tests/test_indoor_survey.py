@@ -105,6 +105,42 @@ def test_the_smoother_is_nearer_than_the_filter_and_says_so_honestly():
     assert (delta**2 < 5.991 * (sd**2).sum(axis=1)).mean() > 0.85
 
 
+def test_simulated_walks_lie_within_the_bounds_of_consistency(tmp_path):
+    """NEES of the particle filter over 16 walks at one time lies in its χ² bounds, with the simulator's own figures.
+
+    At one time, as errors of one walk hang together (Bar-Shalom et al. 2001, section 5.4). The start is drawn from
+    the doubt that the filter is told. Over three times the bounds are those of 99.9 %: three chances to miss.
+    """
+    from scipy.stats import chi2
+
+    told = "known_start=true,fast_db=3,slow_db=2,correlation_m=3,heading_sd_deg=6,scale_sd=0.07"
+    rng = np.random.default_rng(11)
+    walks, times = 16, (0.35, 0.65, 0.98)
+    nees = np.empty((walks, len(times)))
+    for k in range(walks):
+        made = simulate(
+            "floor-walk",
+            tmp_path,
+            seed=500 + k,
+            blocked_share=0.0,
+            rest_s=3.0,
+            step_m=rng.uniform(0.62, 0.78),
+        )
+        convert(made.paths, tmp_path / "w.mcap", overwrite=True)
+        rec = open_recording(tmp_path / "w.mcap")
+        x, y = np.array([2.5, 2.2]) + rng.standard_normal(2)
+        run = replay(rec, [f"indoor.fused[{told},start_x={x:.3f},start_y={y:.3f}]"], metrics=False).runs[0]
+        truth, at, sd = rec.table("/reference/pose"), run.tables["position"], run.tables["sigma"]
+        t = at["t_ns"].to_numpy()
+        rows = np.searchsorted(t, t[0] + np.array(times) * (t[-1] - t[0]))
+        nees[k] = 0.0
+        for axis in "xy":
+            wrong = at[f"pos_{axis}"].to_numpy() - np.interp(t, truth["t_ns"], truth[f"pos_{axis}"])
+            nees[k] += (wrong[rows] / sd[f"sigma_pos_{axis}"].to_numpy()[rows]) ** 2
+    low, high = chi2.ppf([0.0005, 0.9995], 2 * walks) / walks
+    assert ((nees.mean(axis=0) > low) & (nees.mean(axis=0) < high)).all(), (low, nees.mean(axis=0), high)
+
+
 def test_given_steps_are_not_detected_a_second_time():
     """Steps of 0.5 m and accelerations of the same steps together go 10 m, not 20."""
     n = 20
