@@ -12,6 +12,9 @@ from marcha.ingest import convert
 from marcha.ingest.simulate import simulate
 from marcha.recording import UsageError
 from marcha.replay import replay
+from marcha.viz.report import report
+
+from .viz_helpers import drawn
 
 
 @pytest.fixture(scope="module")
@@ -27,13 +30,13 @@ def test_every_condition_its_and_and_the_cleaned_result_are_drawn(walk: Path, tm
     out = tmp_path / "out.mcap"
     runs = ["foot.9iez[detector=c1c2c3]", "foot.9iez[detector=pitch]", "foot.9iez"]
     replay(mr.open(walk), runs, inputs=["/foot/imu2"], out=out, metrics=False)
-    drawn: Any = viz.figure(mr.open(out), kind="conditions")
-    titles = [ax.get_title(loc="left") for ax in drawn.axes]
+    figure: Any = viz.figure(mr.open(out), kind="conditions")
+    titles = [ax.get_title(loc="left") for ax in figure.axes]
     for name in ("acc_norm", "acc_var", "gyr_norm", "pitch_dev", "pitch_var", "shoe"):
         assert any(f": {name} (detector" in t for t in titles)
     lanes = [
         [t.get_text() for t in ax.get_yticklabels()]
-        for ax in drawn.axes
+        for ax in figure.axes
         if "0 or 1" in ax.get_title(loc="left")
     ]
     assert lanes[0] == ["cleaned: still", "all of them", "gyr_norm", "acc_var", "acc_norm"]
@@ -44,3 +47,23 @@ def test_every_condition_its_and_and_the_cleaned_result_are_drawn(walk: Path, tm
 def test_without_a_detector_one_line_says_so(walk: Path) -> None:
     with pytest.raises(UsageError, match="no stance detector"):
         viz.figure(mr.open(walk), kind="conditions")
+
+
+def test_the_viewer_has_a_lane_for_each_condition_and_says_first_what_must_not_be_used(
+    tmp_path: Path,
+) -> None:
+    made = simulate("rectangle", tmp_path, seed=1, laps=2, config="3030")
+    convert(made.paths, tmp_path / "clipped.mcap")
+    out = tmp_path / "out.mcap"
+    runs = ["foot.15iez-zaru", "foot.9iez[detector=c1c2c3]"]
+    results = replay(
+        mr.open(tmp_path / "clipped.mcap"), runs, inputs=["/foot/imu2"], out=out, metrics=False
+    ).runs
+    assert [r.fatal for r in results] == [True, False]
+    _, canvas = drawn(mr.open(out), tmp_path)
+    panels = {(e.tab, e.kind, e.path.rsplit("/", 1)[-1]) for e in canvas.entries}
+    assert {("Detector", "lanes", name) for name in ("acc_norm", "acc_var", "gyr_norm", "shoe")} <= panels
+    assert ("Overview", "document", "verdict") in panels
+    text = report(mr.open(out))
+    assert text.index("results must not be used") < text.index("## Metrics")
+    assert f"{results[1].run}: results must not be used" not in text

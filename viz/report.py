@@ -83,7 +83,7 @@ def verdicts(runs: Mapping[str, Mapping[str, str]]) -> list[str]:
             parts.append(f"- **{printable(run)}: results must not be used** ({', '.join(kinds)})")
         elif kinds:
             parts.append(f"- {printable(run)}: {', '.join(kinds)}")
-    return ["## Verdict", "", *parts, "", "Details below, under findings.", ""] if parts else []
+    return ["## Verdict", "", *parts, "", "Details: the findings in the report.", ""] if parts else []
 
 
 def replay_report(result: ReplayResult) -> str:

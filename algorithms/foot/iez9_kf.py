@@ -149,6 +149,7 @@ def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
     if core.starts(s):
         base.believe_rest(s, base.ATT)
         _believe_rest(s)
+        s.unknown_bias = s.rest.bias_variance  # of what is walked before the first long rest shows the bias
     elif s.started:
         _advance(s, r)
         base.predict(s, r)
