@@ -27,7 +27,7 @@ def turn_to_sensor(rate: FloatArray, seen: FloatArray) -> Rotation:
     keep = np.linalg.norm(seen, axis=1) < 12.0
     found = Rotation.identity()
     for _ in range(6):
-        found, _ = Rotation.align_vectors(rate[keep], seen[keep])
+        found = Rotation.align_vectors(rate[keep], seen[keep])[0]
         misfit = np.linalg.norm(rate - found.apply(seen), axis=1)
         keep &= misfit < 3.0 * np.median(misfit)
     return found
