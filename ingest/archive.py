@@ -8,9 +8,12 @@ import stat
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
-from ..recording.errors import MarchaError
+from ..recording.errors import MarchaError, one_line
+from ..recording.scratch import scratch_folder
 
 UNPACK_LIMIT_GB = 2.0
 """Total that an archive may unpack to, unless an option raises it."""
@@ -27,6 +30,24 @@ def is_zip(path: Path) -> bool:
             return f.read(4) in (b"PK\x03\x04", b"PK\x05\x06") and zipfile.is_zipfile(path)
     except OSError:
         return False
+
+
+@contextmanager
+def unpacked(path: Path, limit_gb: float = UNPACK_LIMIT_GB) -> Iterator[Path]:
+    """Give a temporary folder with what an archive holds; an error that names it names archive and member.
+
+    Raises
+    ------
+    MarchaError
+        As :func:`unpack` says.
+    """
+    with scratch_folder() as folder:
+        unpack(path, folder, limit_gb)
+        try:
+            yield folder
+        except MarchaError as error:
+            error.args = (one_line(str(error).replace(str(folder), str(path))),)
+            raise
 
 
 def unpack(path: Path, folder: Path, limit_gb: float = UNPACK_LIMIT_GB) -> None:

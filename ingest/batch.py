@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..recording.errors import MarchaError
-from ..recording.scratch import scratch_folder
 from . import registry
-from .archive import UNPACK_LIMIT_GB, is_zip, unpack
+from .archive import UNPACK_LIMIT_GB, is_zip, unpacked
 
 
 class LogsFound(NamedTuple):
@@ -75,8 +74,7 @@ def logs(
             raise MarchaError(f"{path}: no such file or folder")
         folder = path
         if path.is_file() and is_zip(path):
-            folder = stack.enter_context(scratch_folder())
-            unpack(path, folder, unpack_limit_gb)
+            folder = stack.enter_context(unpacked(path, unpack_limit_gb))
             archives[folder] = path
         if not folder.is_dir() or _names(folder, format):
             found.append(path)

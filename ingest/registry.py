@@ -16,8 +16,7 @@ from ..recording.errors import MarchaError, UsageError
 from ..recording.files import require_regular
 from ..recording.options import options_of
 from ..recording.plugins import plugins
-from ..recording.scratch import scratch_folder
-from .archive import UNPACK_LIMIT_GB, is_zip, unpack
+from .archive import UNPACK_LIMIT_GB, is_zip, unpacked
 from .contract import HEAD_BYTES, CommonOptions, Importer
 from .truth import is_side_file
 from .workbook import is_workbook
@@ -269,7 +268,7 @@ def _resolve(
     if path.is_dir():
         folder = path
     elif archive:
-        folder = _unpack(path, stack, limit_gb)
+        folder = stack.enter_context(unpacked(path, limit_gb))
         if inner := _candidates(folder, wanted):
             return [(inner[0].name, folder)]
         if wanted is not None and folders:
@@ -333,12 +332,6 @@ def _head(path: Path) -> bytes:
             return f.read(HEAD_BYTES)
     except OSError as error:
         raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
-
-
-def _unpack(path: Path, stack: contextlib.ExitStack, limit_gb: float) -> Path:
-    folder = stack.enter_context(scratch_folder())
-    unpack(path, folder, limit_gb)
-    return folder
 
 
 def _checked(kind: Any) -> Any:

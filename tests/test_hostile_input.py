@@ -210,6 +210,18 @@ def test_an_archive_of_logs_for_one_recording_names_the_remedy(tmp_path: Path) -
     assert "-o FOLDER/" in done.complaint
 
 
+@pytest.mark.parametrize("several", [False, True])
+def test_an_error_inside_an_archive_names_archive_and_member(tmp_path: Path, several: bool) -> None:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as file:
+        file.writestr("day1/walk.csv", xio([1e30 + k for k in range(300)]))
+    output = (tmp_path / "out", "--json") if several else (tmp_path / "out.mcap",)
+    if several:
+        (tmp_path / "out").mkdir()
+    done = marcha("convert", tmp_path / "a.zip", "-o", *output)
+    assert done.code == 1
+    assert done.complaint.startswith(f"{tmp_path / 'a.zip' / 'day1' / 'walk.csv'}: no row of numbers")
+
+
 def test_a_file_that_was_read_beside_a_log_is_not_called_skipped(tmp_path: Path) -> None:
     logs = tmp_path / "logs"
     logs.mkdir()
