@@ -19,6 +19,7 @@ from .contract import ReportBuilder
 from .text import start_of
 
 UNIT = re.compile(r"[\[(]([^\])]*)[\])]")
+_BETWEEN = re.compile(r"[\s_\-.:]+")
 SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))
 """Least number of a time since 1970, and its unit in seconds: 1973 to 5138 in each."""
@@ -52,9 +53,8 @@ class TableHeader:
                 found[role] = self.names.index(name)
         for i, name in enumerate(self.names):
             if i not in found.values():
-                role = next(
-                    (r for r, p in roles.items() if r not in found and re.fullmatch(p, plain(name))), None
-                )
+                bare = plain(name)
+                role = next((r for r, p in roles.items() if r not in found and re.fullmatch(p, bare)), None)
                 if role is not None:
                     found[role] = i
         return found
@@ -63,7 +63,7 @@ class TableHeader:
 def plain(name: str) -> str:
     """Return a column's name in lower case, without unit, words apart by one blank."""
     bare = UNIT.sub(" ", name.strip().strip('"').lower())
-    return re.sub(r"[\s_\-.:]+", " ", bare).strip()
+    return _BETWEEN.sub(" ", bare).strip()
 
 
 def header_of(head: bytes) -> TableHeader | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import subprocess
@@ -17,8 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from marcha.cli import contents
 from marcha.cli.app import COMMANDS
-from marcha.cli.console import TextTable, folded, number
-from marcha.cli.options import instant, limits, settings
+from marcha.cli.console import TextTable, folded, number, progress
+from marcha.cli.options import DEFAULT, instant, limits, settings
 from marcha.cli.reference import page
 from marcha.recording import UsageError
 
@@ -324,3 +325,14 @@ def test_limits_are_numbers(value: float) -> None:
 )
 def test_cells(value: object, text: str) -> None:
     assert number(value) == text
+
+
+def test_before_the_first_sample_the_bar_says_what_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True)
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with progress("replay", DEFAULT, before="estimators are compiled") as report:
+        assert report is not None
+        assert "estimators are compiled" in terminal.getvalue()
+        report(30, 100)
+    assert "30 %" in terminal.getvalue()

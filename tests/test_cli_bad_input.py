@@ -366,3 +366,18 @@ def test_a_process_that_is_ended_in_mid_write_leaves_no_output(
         assert left == set()
     assert marcha(*arguments).code == 0
     assert {p.name for p in tmp_path.iterdir()} == {log.name, "a.mcap"}
+
+
+def test_evaluate_of_a_run_that_failed_says_so_and_gives_no_metrics(tmp_path: Path) -> None:
+    """A foot that shakes from the first sample to the last gives an estimator nothing to begin with."""
+    assert convert(tmp_path, text(rows())).code in (0, 3)
+    done = tmp_path / "done.mcap"
+    replayed = marcha("replay", tmp_path / "out.mcap", "-e", "foot.9iez", "-o", done, "--json")
+    assert all(run["fatal"] for run in replayed.document["runs"])
+    runs = marcha("evaluate", done, "--json").document["runs"]
+    assert runs
+    shown = " ".join(marcha("evaluate", done).out.split())
+    for run in runs:
+        assert run["metrics"] == {}
+        assert run["note"].startswith("results must not be used: ")
+        assert " ".join(run["note"].split()) in shown
