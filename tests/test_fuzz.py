@@ -16,7 +16,9 @@ from marcha.ingest import registry
 
 from .conftest import ROOT
 from .fuzz import mcap, mutators, seeds
-from .fuzz.server import Failure, Verdict, in_child
+from .fuzz.run import Result, generator, report, run_all
+from .fuzz.server import Failure, Verdict, in_child, together
+from .fuzz.targets import Target
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that fork")
 
@@ -88,6 +90,40 @@ def test_what_no_input_may_do_is_noticed(task: Callable[[], object], kind: str) 
     assert isinstance(verdict, Verdict)
 
 
+@pytest.mark.parametrize("task", [crash, broken, refused])
+def test_tasks_in_one_process_end_with_the_first_that_fails(task: Callable[[], object]) -> None:
+    assert len(together([dict, dict, task, dict])) == 2
+    assert len(together([dict, dict])) == 2
+    assert together([task, dict]) == []
+
+
+def test_a_failure_among_others_is_that_of_its_input(tmp_path: Path) -> None:
+    """Numbers 5 and 17 fail in different ways, 9 only where another ran before it in the same process."""
+    ran: list[int] = []
+
+    def act(rng: np.random.Generator, folder: Path) -> None:
+        drawn = rng.random()
+        number = next(n for n in range(40) if generator(7, "t", n).random() == drawn)
+        assert not list(folder.iterdir())
+        (folder / "in").write_bytes(b"x")
+        if number == 5:
+            os.abort()
+        if number == 17:
+            raise KeyError("t")
+        if number == 9 and ran:
+            raise ValueError
+        ran.append(number)
+
+    result = Result()
+    run_all(result, [Target("t", act)], range(40), tmp_path, seed=7)
+    assert result.inputs == 40
+    assert {f.number: f.verdict.kind for f in result.failed.values()} == {
+        5: "crash",
+        17: "traceback",
+        9: "only after others",
+    }
+
+
 def test_the_same_number_gives_the_same_input() -> None:
     data = b"t,x\n" + b"".join(b"%d,%d\n" % (k, k * k) for k in range(100))
     first, second = (mutators.text(np.random.default_rng(4), data) for _ in "ab")
@@ -111,8 +147,6 @@ def test_records_are_taken_apart_and_put_together_again(tmp_path: Path) -> None:
 
 
 def test_a_failure_names_what_reproduces_it(tmp_path: Path) -> None:
-    from .fuzz.run import Result, report
-
     result = Result()
     for number in (3, 9):
         result.add("import a", number, Verdict("traceback", 'File "/x/ingest/a.py", line 7\nKeyError: 1'))

@@ -9,19 +9,26 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
 from .mutators import Rng
 from .seeds import Seeds
-from .server import Verdict, emptied, in_child, load, loaded, scratch
+from .server import Verdict, emptied, in_child, load, loaded, scratch, together
+
+if TYPE_CHECKING:
+    from .targets import Target
 
 WARM = 4
-"""Inputs of each target that run before all others, so that what they need is loaded once."""
+"""Most inputs of each target that run before all others, so that what they need is loaded once."""
+
+TOGETHER = 16
+"""Inputs of one target that run in one process."""
 
 
 @dataclass
@@ -52,7 +59,6 @@ class Result:
     def add(self, target: str, number: int, verdict: Verdict) -> None:
         """Count one input."""
         self.inputs += 1
-        self.cpu_s += verdict.cpu_s
         tally = self.by_target.setdefault(target, [0, 0.0])
         tally[0] += 1
         tally[1] += verdict.cpu_s
@@ -91,7 +97,7 @@ def generator(seed: int, target: str, number: int) -> Rng:
     return np.random.default_rng([seed, *target.encode(), number])
 
 
-def prepare(place: Path) -> Seeds:
+def prepare(place: Path, warm_inputs: int = WARM) -> Seeds:
     """Make the sound inputs in a process of its own, and load here what that process had loaded."""
 
     def warm() -> object:
@@ -99,7 +105,7 @@ def prepare(place: Path) -> Seeds:
 
         sound = seeds.make(place / "seeds")
         for target in {t.name: t for t in targets.targets(sound)}.values():
-            for number in range(WARM):
+            for number in range(warm_inputs):
                 with emptied(place) as folder, contextlib.suppress(BaseException):
                     target.run(generator(0, target.name, number), folder)
         return sound, *loaded()
@@ -145,7 +151,7 @@ def run(
     began = time.monotonic()
     place = scratch()
     try:
-        sound = prepare(place)
+        sound = prepare(place, min(WARM, 1 + inputs // 1000))
         result = Result()
         if jobs == 1:
             result = _share(sound, place, range(first, first + inputs), seed, only, keep, log)
@@ -205,32 +211,75 @@ def _share(
 ) -> Result:
     from .targets import targets
 
-    chosen = [t for t in targets(sound) if only in t.name]
+    known = targets(sound)
+    chosen = [t for t in known if only == t.name] or [t for t in known if only in t.name]
     if not chosen:
         raise SystemExit(f"no target has {only!r} in its name")
-    result = Result()
-    for number in numbers:
-        target = chosen[number % len(chosen)]
-        with emptied(place) as folder:
-            _, verdict = in_child(lambda t=target, n=number, f=folder: t.run(generator(seed, t.name, n), f))
-            known = result.failures and f"{verdict.kind} {_place(verdict.detail)}" in result.failed
-            result.add(target.name, number, verdict)
-            if verdict.kind and not known:
-                _say(
-                    log,
-                    {
-                        "target": target.name,
-                        "number": number,
-                        "seed": seed,
-                        "kind": verdict.kind,
-                        "detail": verdict.detail,
-                    },
-                )
-                if keep is not None:
-                    shutil.copytree(folder, keep / f"{seed}-{number}", dirs_exist_ok=True)
-        if log is not None and result.inputs % 1000 == 0:
-            _say(log, {"inputs": result.inputs, "failures": result.failures, "at": number})
+    result, began = Result(), sum(os.times()[:4])
+    run_all(result, chosen, numbers, place, seed=seed, keep=keep, log=log)
+    result.cpu_s = sum(os.times()[:4]) - began
     return result
+
+
+def run_all(
+    result: Result,
+    chosen: Sequence[Target],
+    numbers: Sequence[int],
+    place: Path,
+    *,
+    seed: int,
+    keep: Path | None = None,
+    log: Path | None = None,
+) -> None:
+    """Run inputs of the chosen targets, a few in one process, and add what became of them to ``result``."""
+    said = 0
+    for target, todo in _in_groups(chosen, numbers):
+
+        def once(number: int, target: Target = target) -> None:
+            with emptied(place) as folder:
+                target.run(generator(seed, target.name, number), folder)
+
+        while todo:
+            went_well = together([partial(once, number) for number in todo])
+            for number, cpu_s in zip(todo, went_well, strict=False):
+                result.add(target.name, number, Verdict(cpu_s=cpu_s))
+            if len(went_well) < len(todo):
+                _alone(result, target, todo[len(went_well)], place, seed, keep, log)
+            todo = todo[len(went_well) + 1 :]
+        if result.inputs // 1000 > said:
+            said = result.inputs // 1000
+            _say(log, {"inputs": result.inputs, "failures": result.failures})
+
+
+def _in_groups(chosen: Sequence[Target], numbers: Sequence[int]) -> Iterator[tuple[Target, list[int]]]:
+    """Give the numbers of inputs, a few of one target at a time; a number always has the same target."""
+    waiting: dict[str, list[int]] = {}
+    named = {t.name: t for t in chosen}
+    for number in numbers:
+        name = chosen[number % len(chosen)].name
+        group = waiting.setdefault(name, [])
+        group.append(number)
+        if len(group) == TOGETHER:
+            yield named[name], waiting.pop(name)
+    for name, group in waiting.items():
+        yield named[name], group
+
+
+def _alone(
+    result: Result, target: Target, number: int, place: Path, seed: int, keep: Path | None, log: Path | None
+) -> None:
+    """Run again, in a process of its own, an input with which not all went well."""
+    with emptied(place) as folder:
+        _, verdict = in_child(lambda: target.run(generator(seed, target.name, number), folder))
+        if not verdict.kind:
+            verdict = Verdict("only after others", f"of {target.name}, in the same process", verdict.cpu_s)
+        new = f"{verdict.kind} {_place(verdict.detail)}" not in result.failed
+        result.add(target.name, number, verdict)
+        if new:
+            about = {"kind": verdict.kind, "detail": verdict.detail}
+            _say(log, {"target": target.name, "number": number, "seed": seed, **about})
+            if keep is not None:
+                shutil.copytree(folder, keep / f"{seed}-{number}", dirs_exist_ok=True)
 
 
 def _say(log: Path | None, what: dict[str, object]) -> None:
@@ -249,7 +298,8 @@ def report(result: Result, seed: int, *, file: TextIO | None = None) -> None:
         )
         print("  " + found.verdict.detail.strip()[-1500:].replace("\n", "\n  "), file=out)
     print(
-        f"\n{result.inputs} inputs in {result.seconds:.0f} s ({result.cpu_s / 3600:.2f} h of processor), "
+        f"\n{result.inputs} inputs in {result.seconds:.0f} s ({result.cpu_s / 3600:.2f} h of processor, "
+        f"{1e3 * result.cpu_s / max(1, result.inputs):.0f} ms each), "
         f"{result.failures} failures of {len(result.failed)} kinds",
         file=out,
     )

@@ -6,6 +6,7 @@ fuzzed without being named here.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -23,8 +24,8 @@ from ..contracts.exporter import example
 from ..contracts.importer import ImporterContract
 
 TESTS = Path(__file__).resolve().parents[1]
-ROWS = 400
-"""Lines of a sample: what reads them right reads more of them right, and inputs are many."""
+ROWS = (120, 400)
+"""Lines of a sample, more where the format needs more: what reads them right reads more of them right."""
 Rows = dict[str, NDArray[np.uint64]]
 """Topic to the hashes of its rows, sorted."""
 
@@ -114,11 +115,14 @@ def sample(contract: type[ImporterContract], folder: Path) -> Sample:
     }
     main = path.relative_to(folder).as_posix()
     whole = Sample(test.importer.name, contract.__name__, files, main, options)
-    short = {k: v if b"\x00" in v else b"".join(v.splitlines(keepends=True)[:ROWS]) for k, v in files.items()}
-    try:
-        return converted(replace(whole, files=short), folder / "short")
-    except mr.MarchaError:  # a file of few long lines, or one that ends with what makes it whole
-        return converted(whole, folder / "whole")
+    for rows in ROWS:
+        short = {
+            k: v if b"\x00" in v else b"".join(v.splitlines(keepends=True)[:rows]) for k, v in files.items()
+        }
+        # Too few where a file is of few long lines, or ends with what makes it whole.
+        with contextlib.suppress(mr.MarchaError):
+            return converted(replace(whole, files=short), folder / f"short{rows}")
+    return converted(whole, folder / "whole")
 
 
 def converted(sample: Sample, folder: Path) -> Sample:
@@ -145,9 +149,9 @@ def recordings(folder: Path) -> dict[str, bytes]:
     from marcha.replay import replay
 
     folder.mkdir(parents=True)
-    found = {"example": example(folder / "example.mcap", 600).read_bytes()}
+    found = {"example": example(folder / "example.mcap", 300).read_bytes()}
     log = simulate("straight", folder, seed=3, length_m=2).paths[0]
-    log.write_bytes(b"".join(log.read_bytes().splitlines(keepends=True)[:ROWS]))
+    log.write_bytes(b"".join(log.read_bytes().splitlines(keepends=True)[: ROWS[-1]]))
     ingest.convert(log, folder / "walk.mcap")
     with mr.open(folder / "walk.mcap") as rec:
         replay(rec, ["foot.naive"], out=folder / "done.mcap")

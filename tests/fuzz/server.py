@@ -1,10 +1,15 @@
-"""A process for every input: forked from one that has all loaded, with limits of time and memory."""
+"""Processes for inputs: forked from one that has all loaded, with limits of time and memory.
+
+Inputs run a few to a process, since a fresh one spends more on copying pages than on the input; one after which
+not all is well runs again in a process of its own, and that one's verdict counts.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import faulthandler
 import gc
+import io
 import os
 import pickle
 import resource
@@ -15,11 +20,11 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 CPU_S = 5
 """Processor time of one input; a hang by the clock is six times that, since other work may hold the machine."""
@@ -66,11 +71,55 @@ def in_child(
 
     What is called here must have no threads: they do not live on in a forked process.
     """
+    data, late, status, used = _forked([task], cpu_s, memory)
+    if late or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU):
+        return None, Verdict("hang", f"more than {cpu_s:g} s", used)
+    if os.WIFSIGNALED(status):
+        name = signal.Signals(os.WTERMSIG(status)).name
+        return None, Verdict("crash", f"ended by {name}; {data[-300:].decode(errors='replace')}", used)
+    words = _words(data)
+    if not words:
+        return None, Verdict("crash", f"ended with status {status} and no word", used)
+    return words[0].result, Verdict(words[0].kind, words[0].detail, used)
+
+
+def together(tasks: Sequence[Callable[[], Any]]) -> list[float]:
+    """Run tasks one after another in one process, up to the first that does not go well.
+
+    Returns
+    -------
+    list of float
+        Processor time (s) of each task that went well; where they are fewer than the tasks, the next did not.
+    """
+    data, *_ = _forked(tasks, CPU_S, MEMORY_BYTES)
+    return [word.cpu_s for word in _words(data) if not word.kind]
+
+
+class _Word(NamedTuple):
+    """What a process says of one task."""
+
+    result: Any
+    kind: str
+    detail: str
+    cpu_s: float
+
+
+def _words(data: bytes) -> list[_Word]:
+    """Return what a process said before it ended."""
+    found, stream = [], io.BytesIO(data)
+    with contextlib.suppress(Exception):  # the last may be cut short, or be none
+        while True:
+            found.append(_Word(*pickle.load(stream)))
+    return found
+
+
+def _forked(tasks: Sequence[Callable[[], Any]], cpu_s: float, memory: int) -> tuple[bytes, bool, int, float]:
+    """Run tasks in one process; return what it said, whether it was late, its status and processor time (s)."""
     reader, writer = os.pipe()
     pid = os.fork()
     if pid == 0:
         os.close(reader)
-        _be_child(task, writer, cpu_s, memory)
+        _be_child(tasks, writer, cpu_s, memory)
     os.close(writer)
     data, late = _collect(reader, 6 * cpu_s)
     if late:
@@ -79,23 +128,11 @@ def in_child(
     _, status, usage = os.wait4(pid, 0)
     with contextlib.suppress(ProcessLookupError, PermissionError):  # what it started and left running
         os.killpg(pid, signal.SIGKILL)
-    used = usage.ru_utime + usage.ru_stime
-    if late or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU):
-        return None, Verdict("hang", f"more than {cpu_s:g} s", used)
-    if os.WIFSIGNALED(status):
-        name = signal.Signals(os.WTERMSIG(status)).name
-        return None, Verdict("crash", f"ended by {name}; {data[-300:].decode(errors='replace')}", used)
-    try:
-        result, kind, detail, grown = pickle.loads(data)
-    except Exception:
-        return None, Verdict("crash", f"ended with status {status} and no word", used)
-    if not kind and grown > memory:
-        kind, detail = "memory", f"{grown / 1e6:.0f} MB"
-    return result, Verdict(kind, detail, used)
+    return data, late, status, usage.ru_utime + usage.ru_stime
 
 
 def _collect(reader: int, limit_s: float) -> tuple[bytes, bool]:
-    """Return all that comes out of a pipe, and whether it took too long."""
+    """Return all that comes out of a pipe, and whether a task took too long."""
     until, parts = time.monotonic() + limit_s, []
     try:
         while (left := until - time.monotonic()) > 0:
@@ -104,32 +141,39 @@ def _collect(reader: int, limit_s: float) -> tuple[bytes, bool]:
                 if not part:
                     return b"".join(parts), False
                 parts.append(part)
+                until = time.monotonic() + limit_s
         return b"".join(parts), True
     finally:
         os.close(reader)
 
 
-def _be_child(task: Callable[[], Any], writer: int, cpu_s: float, memory: int) -> None:
-    """Do the task, write what became of it, and end without cleaning up: this process shares all with others."""
+def _be_child(tasks: Sequence[Callable[[], Any]], writer: int, cpu_s: float, memory: int) -> None:
+    """Do the tasks, write what became of each, and end without cleaning up: all is shared with others."""
     os.setpgid(0, 0)
     faulthandler.disable()  # a crash is told by its signal
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_CPU, (max(1, int(cpu_s)), int(cpu_s) + 2))
     before = _resident()
     _limit_data(3 * memory)
-    result, kind, detail = None, "", ""
-    try:
-        result = task()
-    except Failure as failure:
-        kind, detail = failure.kind, failure.detail
-    except MemoryError:
-        kind, detail = "memory", traceback.format_exc(limit=-3)
-    except BaseException:
-        kind, detail = "traceback", traceback.format_exc(limit=-6)
-    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
-    data = pickle.dumps((result, kind, detail, grown))
     with os.fdopen(writer, "wb") as out:
-        out.write(data)
+        for task in tasks:
+            began = time.process_time()
+            resource.setrlimit(resource.RLIMIT_CPU, (int(began) + max(1, int(cpu_s)), resource.RLIM_INFINITY))
+            result, kind, detail = None, "", ""
+            try:
+                result = task()
+            except Failure as failure:
+                kind, detail = failure.kind, failure.detail
+            except MemoryError:
+                kind, detail = "memory", traceback.format_exc(limit=-3)
+            except BaseException:
+                kind, detail = "traceback", traceback.format_exc(limit=-6)
+            grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
+            if not kind and grown > memory:
+                kind, detail = "memory", f"{grown / 1e6:.0f} MB"
+            pickle.dump(_Word(result, kind, detail, time.process_time() - began)[:], out)
+            out.flush()
+            if kind:
+                break
     os._exit(0)
 
 
