@@ -236,7 +236,7 @@ def radio(rec: Recording, fig: Figure) -> None:
     topic = _found(rec, "radio signals", _topics(rec, ["mac", "rssi_dbm"]))[0]
     table = rec.table(topic)
     anchors = floor_plan(loaders_of(rec)).anchors
-    counts = table.group_by("mac").len().sort("len", descending=True)["mac"].to_list()
+    counts = table.group_by("mac").len().sort("len", "mac", descending=[True, False])["mac"].to_list()
     macs = sorted(counts, key=lambda m: m.lower() not in anchors)[:8]
     truth = next((t for k, t in _traces(rec).items() if role_of(k) == "reference"), None)
     beside = truth is not None and any(m.lower() in anchors for m in macs)
@@ -254,12 +254,16 @@ def radio(rec: Recording, fig: Figure) -> None:
             axes[2].plot(gone, rssi, ".", markersize=3, **known)
             d = np.geomspace(0.5, max(float(gone.max()), 1.0), 60)
             axes[2].plot(d, anchor.p_d0 - 10 * anchor.eta * np.log10(d), color=color, linewidth=1.0)
-    _dress(axes[0], f"{printable(topic)}, {len(macs)} of {len(counts)} transmitters", TIME, "dBm")
-    _dress(axes[1], "histogram", "dBm", "packets", legend=False)
+    _dress(
+        axes[0], f"{printable(topic)}, {len(macs)} of {len(counts)} transmitters", TIME, "dBm", legend=False
+    )
+    _dress(axes[1], "histogram", "dBm", "packets")  # the legend hides least here
     seen = table["rssi_dbm"].cast(pl.Float64)
     axes[1].set_xlim(float(seen.min() or -100.0) - 3, float(seen.max() or 0.0) + 3)  # type: ignore[arg-type]
     if beside:
-        _dress(axes[2], "over the true distance (lines: the anchors' model)", "m", "dBm", legend=False)
+        _dress(
+            axes[2], "over the true distance (lines: the anchors' model)", "distance (m)", "dBm", legend=False
+        )
         axes[2].set_xscale("log")
 
 
