@@ -16,8 +16,8 @@ PROCESSORS = {"intel": 84, "dec": 85, "sgi": 86}
 
 def write_c3d(
     path: Path,
-    points: NDArray[np.float64],
-    analogs: NDArray[np.float64],
+    points: NDArray[np.floating[Any]],
+    analogs: NDArray[np.floating[Any]],
     *,
     processor: str,
     integers: bool,
@@ -75,7 +75,7 @@ def write_c3d(
     header += encode.floats([scale if integers else -scale])
     header += encode.words([data_start, each]) + encode.floats([rate])
     data = bytearray()
-    seen = np.isfinite(points).all(axis=2)
+    seen = np.asarray(np.isfinite(points).all(axis=2))
     for frame in range(frames):
         for marker in range(markers):
             xyz = np.where(seen[frame, marker], points[frame, marker], 0.0)

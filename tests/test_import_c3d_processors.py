@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import marcha.recording as mr
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from .c3d_files import BLOCK, Encoder, write_c3d
 
 FRAMES, MARKERS, EACH, CHANNELS = 6, 2, 2, 3
-Signals = tuple[NDArray[np.float64], NDArray[np.float64]]
+Signals = tuple[NDArray[np.floating[Any]], NDArray[np.floating[Any]]]
 
 
 @pytest.fixture
