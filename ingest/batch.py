@@ -84,20 +84,15 @@ def logs(
             if any(part.startswith(".") or part == "__MACOSX" for part in file.relative_to(folder).parts):
                 continue
             if names := _names(file, format):
-                inside.append(_chief(file, names[0]))
+                inside.append(registry.chief_of(file, names[0]))
             else:
                 skipped.append((file, f"not {format}" if format else "no known format"))
         inside = list(dict.fromkeys(inside))
         found += inside if len(inside) > 1 or folder == path else [path]
     sides = {(log.parent, f"{log.stem}.truth") for log in found}  # they come along with their log
+    skipped = [(p, why) for p, why in skipped if not any(log in p.parents for log in found)]
     skipped = [(p, why) for p, why in skipped if (p.parent, p.name[: p.name.find(".truth") + 6]) not in sides]
     return LogsFound(list(dict.fromkeys(found)), skipped, archives)
-
-
-def _chief(file: Path, format: str) -> Path:
-    """Return the file that stands for the recording which ``file`` is a part of."""
-    chief = getattr(registry.get(format).importer, "chief", None)
-    return file if chief is None else chief(file)
 
 
 def _names(path: Path, format: str | None) -> list[str]:

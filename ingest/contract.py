@@ -303,8 +303,8 @@ class Importer(Protocol):
         Whether a folder or archive can be one recording although ``sniff`` does not know it. Optional; false
         where it is missing.
     chief : callable
-        ``chief(path) -> Path``: the file that stands for the recording of several files that ``path`` is one of.
-        Optional; each file is a recording of its own where it is missing.
+        ``chief(path) -> Path``: the file or folder that stands for the recording of several files that ``path`` is
+        one of. Optional; each file is a recording of its own where it is missing.
     """
 
     name: ClassVar[str]

@@ -154,6 +154,12 @@ def recognise(path: Path) -> list[Candidate]:
     return sorted(found, key=lambda c: -c.confidence)
 
 
+def chief_of(file: Path, format: str) -> Path:
+    """Return the file or folder that stands for the recording which ``file`` is a part of."""
+    chief = getattr(get(format).importer, "chief", None)
+    return file if chief is None else chief(file)
+
+
 class ChosenSource(NamedTuple):
     """One source of a recording: an importer and the files or folders that it reads together."""
 
@@ -282,7 +288,8 @@ def _resolve(
     files = sorted(p for p in folder.rglob("*") if _is_data(p, folder))
     if not files:
         raise MarchaError(f"{path}: the {'folder' if path.is_dir() else 'archive'} holds no files")
-    inside = [(c[0].name, p) for p in files if (c := _candidates(p, wanted))]
+    parts = [(c[0].name, p) for p in files if (c := _candidates(p, wanted))]
+    inside = list(dict.fromkeys((name, chief_of(p, name)) for name, p in parts))
     if not inside and wanted is not None and len(files) == 1:
         return [(wanted.importer.name, files[0])]
     if not inside:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import sqlite3
 import stat
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 from marcha.ingest import convert, recognise
 from marcha.ingest.archive import unpack
+from marcha.ingest.batch import logs
 from marcha.ingest.formats.android_text import AndroidText
 from marcha.ingest.formats.getsensordata import GetSensorData
 from marcha.ingest.formats.gnsslogger import GnssLogger
@@ -199,6 +202,33 @@ def test_a_line_without_times_is_no_recording(tmp_path: Path) -> None:
     (tmp_path / "l.kml").write_text(f"<kml><Placemark>{line}</Placemark></kml>")
     with pytest.raises(MarchaError, match="no time"):
         read(Kml(), tmp_path / "l.kml")
+
+
+def test_a_route_is_no_recording(tmp_path: Path) -> None:
+    (tmp_path / "r.gpx").write_text('<gpx><rte><rtept lat="48" lon="2"/></rte></gpx>')
+    with pytest.raises(MarchaError, match="no point of a track"):
+        read(Gpx(), tmp_path / "r.gpx")
+
+
+@pytest.mark.parametrize("app", [samples.phyphox, samples.sensor_logger])
+def test_walks_in_one_zip_are_recordings_of_their_own(tmp_path: Path, walk: PhoneWalk, app: Callable) -> None:
+    path = tmp_path / "walks.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in ("one", "two"):
+            (tmp_path / name / "meta").mkdir(parents=True)
+            (tmp_path / name / "meta" / "notes.csv").write_text("a,b\n1,2\n")
+            for file in sorted(app(tmp_path / name, walk).rglob("*.csv")):
+                archive.write(file, file.relative_to(tmp_path))
+    with pytest.raises(MarchaError, match=r"holds 2 recordings: one .*two .*-o FOLDER/"):
+        convert(path, tmp_path / "o.mcap")
+    assert not (tmp_path / "o.mcap").exists()
+    with contextlib.ExitStack() as stack:
+        found = logs([path], stack)
+        assert [p.name for p in found.logs] == ["one", "two"]
+        assert not found.skipped
+        for folder in found.logs:
+            done = convert(folder, tmp_path / f"{folder.name}.mcap")
+            assert {c.topic: c.count for c in done.channels}["/phone/acc"] == len(walk.t_ns)
 
 
 def test_reference_track(tmp_path: Path, walk: PhoneWalk) -> None:

@@ -86,10 +86,17 @@ class Phyphox:
     def sniff(self, head: bytes, path: Path) -> float:
         """A header of phyphox; of a folder: in one of its files."""
         if path.is_dir():
-            return max((self.sniff(start_of(p), p) for p in _tables(path)), default=0.0)
+            tables = _tables(path)
+            if len({p.parent for p in tables}) > 1:  # several measurements are several recordings
+                return 0.0
+            return max((self.sniff(start_of(p), p) for p in tables), default=0.0)
         if find_header(head, _is_header) is not None:
             return 0.9
         return 0.6 if _saved_by_spreadsheet(head) else 0.0
+
+    def chief(self, path: Path) -> Path:
+        """Return the folder of a table: a measurement is all of its tables."""
+        return path.parent
 
     def read(self, paths: Sequence[Path], options: PhyphoxOptions) -> Import:
         """Read a folder, or the files given."""
@@ -137,11 +144,10 @@ class Phyphox:
 
 
 def _tables(folder: Path) -> list[Path]:
-    """Return the CSV files of a measurement: not those of ``meta``, not deeper than a zip's top folder."""
+    """Return the CSV files of measurements: not those of ``meta``, not deeper than a zip's top folder."""
     found = sorted(p for p in (*folder.glob("*.csv"), *folder.glob("*/*.csv")) if p.is_file())
     known = [p for p in found if p.parent.name != "meta" and p.name not in ("time.csv", "device.csv")]
-    mine = [p for p in known if find_header(start_of(p), _is_header) or _saved_by_spreadsheet(start_of(p))]
-    return [p for p in mine if p.parent == mine[0].parent] if mine else []
+    return [p for p in known if find_header(start_of(p), _is_header) or _saved_by_spreadsheet(start_of(p))]
 
 
 def _is_header(cells: Sequence[str]) -> bool:

@@ -79,12 +79,17 @@ class SensorLogger:
     def sniff(self, head: bytes, path: Path) -> float:
         """Its columns, keys or tables."""
         if path.is_dir():
-            return max((0.92 for p in _files(path) if find_header(start_of(p), _is_header)), default=0.0)
+            folders = {p.parent for p in _files(path) if find_header(start_of(p), _is_header)}
+            return 0.92 if len(folders) == 1 else 0.0  # several folders are several recordings
         if head.startswith(b"SQLite format 3\x00"):
             return 0.9 if b"seconds_elapsed" in head else 0.0
         if head.lstrip().startswith(b"["):
             return 0.9 if b'"seconds_elapsed"' in head and b'"sensor"' in head else 0.0
         return 0.9 if find_header(head, _is_header) else 0.0
+
+    def chief(self, path: Path) -> Path:
+        """Return the folder of a table: a recording is all of its tables."""
+        return path.parent if path.suffix.lower() == ".csv" else path
 
     def read(self, paths: Sequence[Path], options: SensorLoggerOptions) -> Import:
         """Read a folder or a file."""

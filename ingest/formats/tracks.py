@@ -91,7 +91,9 @@ def _blocks(
         raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (ElementTree.ParseError, ValueError) as error:
         raise MarchaError(f"{path}: is no whole XML of a track: {error}") from None
-    if found and not any(p[0] for p in found):
+    if not found:
+        raise MarchaError(f"{path}: no point of a track; routes and waypoints are no recording")
+    if not any(p[0] for p in found):
         raise MarchaError(
             f"{path}: {len(found)} points and no time: a line is no recording; draw it over a map as GeoJSON"
         )
