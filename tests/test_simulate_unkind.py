@@ -102,3 +102,11 @@ def test_a_lift_carries_a_standing_foot() -> None:
     )  # of the step of degree 7
     climbed = np.concatenate(([0.0], np.cumsum(0.5 * np.diff(walk.t) * (walk.vel[1:, 2] + walk.vel[:-1, 2]))))
     assert np.abs(climbed - (walk.pos[:, 2] - walk.pos[0, 2])).max() < 0.01
+
+
+def test_a_lift_is_not_seen_as_the_documentation_says() -> None:
+    """A limit, not a promise: who mends it changes docs/estimators.md too."""
+    walk = sim.walk("lift", seed=1)
+    result, _ = run("foot.9iez", rows_of(walk.t, *walk.measured()))
+    upstairs = walk.still & (walk.pos[:, 2] > 2.9)
+    assert abs(np.nanmedian(result["pose.pos_z"][upstairs])) < 0.3
