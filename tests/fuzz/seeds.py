@@ -117,7 +117,8 @@ def sample(contract: type[ImporterContract], folder: Path) -> Sample:
     whole = Sample(test.importer.name, contract.__name__, files, main, options)
     for rows in ROWS:
         short = {
-            k: v if b"\x00" in v else b"".join(v.splitlines(keepends=True)[:rows]) for k, v in files.items()
+            k: v if b"\x00" in v or k.endswith(".toml") else b"".join(v.splitlines(keepends=True)[:rows])
+            for k, v in files.items()
         }
         # Too few where a file is of few long lines, or ends with what makes it whole.
         with contextlib.suppress(mr.MarchaError):
