@@ -198,6 +198,15 @@ def _unpacked(body: bytes) -> tuple[tuple[int, ...], bytes]:
     return head, packed
 
 
+def _intact(body: bytes) -> bool:
+    """Whether a chunk can still be taken apart: an earlier change may have damaged it."""
+    try:
+        records(_unpacked(body)[1], 0)
+    except (ValueError, OverflowError, RuntimeError, struct.error, zstandard.ZstdError, MemoryError):
+        return False
+    return True
+
+
 def _packed(first: int, last: int, size: int, crc: int, data: bytes, name: str) -> bytes:
     packed = {"zstd": zstandard.ZstdCompressor(1).compress, "lz4": lz4.frame.compress}.get(name, bytes)(data)
     said = name.encode()
@@ -213,7 +222,7 @@ def _packed(first: int, last: int, size: int, crc: int, data: bytes, name: str) 
 def _chunk(rng: Rng, parts: list[Record]) -> str:
     """Damage what a chunk holds, with a checksum that fits, and what its head says of it."""
     at = _any(rng, parts, Opcode.CHUNK)
-    if at is None:
+    if at is None or not _intact(parts[at].body):
         return "none"
     (first, last, size, crc), data = _unpacked(parts[at].body)
     how, name = int(rng.integers(7)), str(pick(rng, ("zstd", "lz4", "", "zstd", "xyz", "\x1b[1m")))
@@ -264,7 +273,7 @@ def _message(rng: Rng, inner: list[Record]) -> None:
 def _loose(rng: Rng, parts: list[Record]) -> str:
     """Put the records of a chunk beside it, as a file without chunks has them."""
     at = _any(rng, parts, Opcode.CHUNK)
-    if at is not None:
+    if at is not None and _intact(parts[at].body):
         inner = records(_unpacked(parts[at].body)[1], 0)
         for _ in range(int(rng.choice([0, 2]))):
             _message(rng, inner)
