@@ -33,6 +33,7 @@ PRIMITIVES: dict[str, str] = {
 
 _PACKAGE = __name__.rpartition(".")[0]
 _SEPARATOR = "=" * 80
+_NAME = re.compile("[A-Za-z0-9_]+")
 _LINE = re.compile(
     r"^(?P<type>[A-Za-z][\w/]*)(?P<bound><=\d+)?(?P<array>\[(?:<=)?\d*\])?\s+"
     r"(?P<name>[A-Za-z]\w*)\s*(?P<constant>=)?\s*(?P<rest>.*)$"
@@ -196,6 +197,8 @@ def _require(field: Field, library: dict[str, Definition]) -> None:
 
 def _text(name: str) -> str:
     package, _, base = short_name(name).partition("/")
+    if not _NAME.fullmatch(package) or not _NAME.fullmatch(base):  # it becomes part of a path
+        raise MarchaError(f"message type {name!r}: a name is package/Type, of letters, digits and _")
     file = resources.files(_PACKAGE).joinpath("msg", package, f"{base}.msg")
     try:
         return file.read_text(encoding="utf-8")

@@ -143,7 +143,7 @@ def test_trc_rows(rec: Recording, tmp_path: Path) -> None:
     export(rec, "trc", tmp_path / "a.trc", options={"y_up": "false"})
     lines = (tmp_path / "a.trc").read_text().split("\n")
     assert lines[3].split("\t")[:3] == ["Frame#", "Time", "heel"]
-    got = np.array([[float(v) for v in line.split("\t")[2:]] for line in lines[6:] if line])
+    got = np.array([[float(v) for v in line.rstrip("\t").split("\t")[2:]] for line in lines[6:] if line])
     assert np.array_equal(
         got, table(rec, "/reference/markers").select("heel.x", "heel.y", "heel.z").to_numpy()
     )

@@ -68,3 +68,9 @@ def test_a_line_that_is_nothing_is_named():
 def test_unknown_dependency_is_named():
     with pytest.raises(MarchaError, match="other/Thing"):
         parse_full("pkg/A", "other/Thing x\n")
+
+
+@pytest.mark.parametrize("name", ["a\0b/Thing", "../Thing", "a/", "é/Thing"])
+def test_a_name_that_is_none_never_becomes_a_path(name: str) -> None:
+    with pytest.raises(MarchaError, match="a name is package/Type"):
+        load(name)

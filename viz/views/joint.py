@@ -71,6 +71,8 @@ class Angles(View):
 
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
         for column, (path, factor) in self.columns.items():
+            if column not in block.columns:  # declared by a recording of other makers, in no message
+                continue
             values = columns_of(block, [column], [factor])[:, 0]
             self.canvas.scalars(path, t_ns, values)
             if column in self.joints:
