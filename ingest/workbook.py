@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import polars as pl
@@ -38,7 +39,7 @@ def read_workbook(path: Path) -> dict[str, pl.DataFrame]:
     return {name: _table(rows) for name, rows in sheets.items()}
 
 
-def _table(rows: list[list[object]]) -> pl.DataFrame:
+def _table(rows: Sequence[Sequence[object]]) -> pl.DataFrame:
     filled = [row for row in rows if any(cell not in ("", None) for cell in row)]
     if not filled:
         return pl.DataFrame()

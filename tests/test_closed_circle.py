@@ -16,7 +16,6 @@ import gpxpy
 import marcha.recording as mr
 import numpy as np
 import polars as pl
-import pympi
 import pytest
 from marcha.export import available, export
 from marcha.ingest import convert
@@ -26,6 +25,8 @@ from marcha.recording.changes import change
 from marcha.replay import replay
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from pympi.Elan import Eaf
+from pympi.Praat import TextGrid
 from rerun.chunk import RrdReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
@@ -348,14 +349,14 @@ def by_events(rec: Recording, path: Path) -> None:
 
 
 def by_pympi_eaf(rec: Recording, path: Path) -> None:
-    eaf = pympi.Elan.Eaf(str(path))
+    eaf = Eaf(str(path))
     tiers = [t for t in eaf.get_tier_names() if t.split(" [")[0] == "manual"]
     found = {label: a / 1e3 for t in tiers for a, _, label, *_ in eaf.get_annotation_data_for_tier(t)}
     assert found == pytest.approx(seconds(rec), abs=1e-3)
 
 
 def by_pympi_grid(rec: Recording, path: Path) -> None:
-    grid = pympi.Praat.TextGrid(str(path), codec="utf-8")
+    grid = TextGrid(str(path), codec="utf-8")
     found = {}
     for tier in grid.get_tiers():
         if tier.name.startswith("manual"):

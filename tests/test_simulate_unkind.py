@@ -42,7 +42,8 @@ def test_every_error_is_drawn_by_the_seed_and_leaves_the_others_alone() -> None:
 def test_each_error_shows_in_its_sensor_only(field: str) -> None:
     quiet: dict[str, Any] = {"errors": "none", "rest_s": 1.0}
     ideal = sim.walk("straight", seed=2, **quiet).measured()
-    wrong = sim.walk("straight", seed=2, **(quiet | {field: 0.05})).measured()
+    unkind: dict[str, Any] = quiet | {field: 0.05}
+    wrong = sim.walk("straight", seed=2, **unkind).measured()
     moved = [float(np.abs(a - b).max()) for a, b in zip(ideal, wrong, strict=True)]
     own = 0 if "acc" in field else 1
     assert moved[own] > 1e-3

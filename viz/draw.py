@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import rerun as rr
 
@@ -101,11 +102,11 @@ def send_facts(
     """
     begin = f"{prefix[1:]} " if prefix else ""
     for name in OF_THE_WALK:
-        facts = {printable(k): _fact(v) for k, v in rec.metadata.get(name, {}).items()}
+        facts: dict[str, Any] = {printable(k): _fact(v) for k, v in rec.metadata.get(name, {}).items()}
         if facts:
             stream.send_property(f"{begin}{name}", rr.AnyValues(**facts))
     for run in metrics.runs if not isinstance(metrics, str) else ():
-        values = dict(run.metrics)
+        values: dict[str, Any] = dict(run.metrics)
         if values:
             stream.send_property(f"{begin}metrics {run.run}", rr.AnyValues(**values))
 

@@ -166,7 +166,7 @@ def _number(metadata: Mapping[str, str], key: str) -> float | None:
 def _boxes(ax: Axes, t: NDArray[np.float64], still: Bools) -> None:
     edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
     for a, b in zip(edges[::2], edges[1::2], strict=True):
-        ax.axvspan(t[a], t[min(b, len(t) - 1)], color="#000000", alpha=0.08, linewidth=0)
+        ax.axvspan(float(t[a]), float(t[min(b, len(t) - 1)]), color="#000000", alpha=0.08, linewidth=0)
 
 
 def _dress(ax: Axes, title: str, unit: str, *, legend: bool = True) -> None:
