@@ -52,7 +52,8 @@ def test_ideal_readings_integrate_to_the_trajectory(scenario: str, style: dict) 
     motion = fine(scenario, 2, 2000, length_m=6, stair_steps=4, rest_s=0.5, **style)
     pos, rot = strapdown(motion, 1 / 2000)
     truth = motion.pos[2::2]
-    assert np.abs(pos[: len(truth)] - truth).max() < 2e-3
+    most = 3e-3 if scenario == "lift" else 2e-3  # the longest of them, with two rides
+    assert np.abs(pos[: len(truth)] - truth).max() < most
     end = Rotation.from_quat(motion.quat_wxyz[2::2][-1], scalar_first=True).as_matrix()
     assert np.degrees(np.arccos(np.clip((np.trace(rot.T @ end) - 1) / 2, -1, 1))) < 0.05
 
@@ -431,8 +432,9 @@ def test_any_walk_stands_on_its_footfalls(
     np.testing.assert_allclose(np.linalg.norm(w.quat_wxyz, axis=1), 1, atol=1e-12)
     assert (np.abs(np.diff(w.quat_wxyz, axis=0)).max() < 1) or rate_hz < 60
     rests = w.pos[w.still]
-    feet = w.simulation.route.footfalls[:, :3]
-    nearest = np.min(np.linalg.norm(rests[:, None] - feet[None], axis=2), axis=1)
+    axes = 2 if scenario == "lift" else 3  # a lift carries the foot away from where it fell
+    feet = w.simulation.route.footfalls[:, :axes]
+    nearest = np.min(np.linalg.norm(rests[:, None, :axes] - feet[None], axis=2), axis=1)
     assert nearest.max() < 1e-9
 
 
