@@ -178,7 +178,7 @@ LEAST_JUDGED = 10
 SURPRISING = 0.3
 """Share of the stances outside what the filter expects of 999 in 1000 (good walks: below 0.2)."""
 FEWEST_STEPS = 0.6
-"""Steps to one swing, or swings to one step (good walks: above 0.75, simulated stairs 0.63: a slow swing may turn twice)."""
+"""Steps to one swing, or swings to one step; a slow swing may turn twice (good walks: above 0.75; stairs: 0.63)."""
 WAY_IN_STEPS = 1.5, 4.0
 """Way of the track to the sum of the steps (walks: 0.9 to 1.3): doubtful from the first on, lost from the second."""
 BIAS_MOVED = 5.0, 10.0
