@@ -18,25 +18,11 @@ from .contracts.estimator import EstimatorContract, Tables
 from .phone_runs import run_phone, sensor_tables
 from .phone_samples import short_walk
 
-FIXES = ("lat_deg", "lon_deg", "alt_m", "sd_east_m", "sd_north_m", "sd_up_m")
-
 
 @cache
 def sensors() -> dict[str, pl.DataFrame]:
     """Return tables of a walk of 10 m by sensor, about 12 s."""
-    walk = short_walk(rate_hz=25, rest_s=1.5, pressure_hz=1, seed=4)
-    t_ns = pl.Series("t_ns", walk.t_ns)
-
-    def table(name: str, values: np.ndarray) -> pl.DataFrame:
-        return pl.DataFrame([t_ns, *(pl.Series(f"{name}_{a}", values[:, i]) for i, a in enumerate("xyz"))])
-
-    return {
-        "acc": table("acc", walk.acc_b),
-        "gyr": table("gyr", walk.gyr_b),
-        "mag": table("mag", walk.mag_b),
-        "pressure": walk.pressure,
-        "gnss": walk.fixes.select("t_ns", *FIXES).with_columns(status=pl.lit(0)),
-    }
+    return sensor_tables(short_walk(rate_hz=25, rest_s=1.5, pressure_hz=1, seed=4))
 
 
 class PhoneContract(EstimatorContract):
