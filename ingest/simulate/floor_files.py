@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +10,8 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from ...recording.errors import MarchaError, OutputExists
 from .floor import ANCHORS, HELD_Z, SIZE_M, FloorWalk, floor_walk
+from .together import written_together
 
 
 def write_floor(
@@ -34,24 +32,12 @@ def write_floor(
     stem = name or f"{scenario}-{seed:03d}"
     log = folder / stem
     truths = [folder / f"{stem}.truth{part}" for part in (".csv", ".steps.csv", ".toml")]
-    for path in (log, *truths):
-        if path.exists() and not overwrite:
-            raise OutputExists(path)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".marcha-") as made:
-            part = Path(made)
-            (part / stem).mkdir()
-            _tables(part / stem, walk)
-            _truth(walk).write_csv(part / truths[0].name)
-            walk.phone.steps.with_columns(_headings(walk)).write_csv(part / truths[1].name)
-            (part / truths[2].name).write_bytes(msgspec.toml.encode(_facts(walk)))
-            for path in (log, *truths):
-                if path.is_dir():
-                    shutil.rmtree(path)
-                (part / path.name).replace(path)
-    except OSError as error:
-        raise MarchaError(f"{error.filename or folder}: cannot write: {error.strerror or error}") from error
+    with written_together(folder, (log, *truths), overwrite=overwrite) as part:
+        (part / stem).mkdir()
+        _tables(part / stem, walk)
+        _truth(walk).write_csv(part / truths[0].name)
+        walk.phone.steps.with_columns(_headings(walk)).write_csv(part / truths[1].name)
+        (part / truths[2].name).write_bytes(msgspec.toml.encode(_facts(walk)))
     return [log], truths, walk
 
 

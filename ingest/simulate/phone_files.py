@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +9,10 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from ...recording.errors import MarchaError, OutputExists, UsageError
+from ...recording.errors import UsageError
 from .phone import PhoneWalk, phone_walk
 from .phone_world import RADIAL_68, geodetic
+from .together import written_together
 
 PHONE_FORMATS = ("android-text", "phyphox", "sensor-logger")
 
@@ -49,26 +48,14 @@ def write_phone(
     stem = name or f"{scenario}-{seed:03d}"
     log = folder / (f"{stem}.txt" if format == "android-text" else stem)
     truths = [folder / f"{stem}.truth{part}" for part in (".csv", ".steps.csv", ".fix.csv", ".toml")]
-    for path in (log, *truths):
-        if path.exists() and not overwrite:
-            raise OutputExists(path)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=folder, prefix=".marcha-") as made:
-            part = Path(made)
-            _WRITERS[format](part / log.name, walk)
-            origin = 0 if format != "phyphox" else int(walk.t_ns[0])
-            _truth(walk, origin).write_csv(part / truths[0].name)
-            steps = walk.steps.with_columns(pl.col("start_ns") - origin, pl.col("end_ns") - origin)
-            steps.write_csv(part / truths[1].name)
-            _truth_places(walk, origin).write_csv(part / truths[2].name)
-            (part / truths[3].name).write_bytes(msgspec.toml.encode(_facts(walk, format)))
-            for path in (log, *truths):
-                if path.is_dir():
-                    shutil.rmtree(path)
-                (part / path.name).replace(path)
-    except OSError as error:
-        raise MarchaError(f"{error.filename or folder}: cannot write: {error.strerror or error}") from error
+    with written_together(folder, (log, *truths), overwrite=overwrite) as part:
+        _WRITERS[format](part / log.name, walk)
+        origin = 0 if format != "phyphox" else int(walk.t_ns[0])
+        _truth(walk, origin).write_csv(part / truths[0].name)
+        steps = walk.steps.with_columns(pl.col("start_ns") - origin, pl.col("end_ns") - origin)
+        steps.write_csv(part / truths[1].name)
+        _truth_places(walk, origin).write_csv(part / truths[2].name)
+        (part / truths[3].name).write_bytes(msgspec.toml.encode(_facts(walk, format)))
     return [log], truths, walk
 
 
