@@ -14,6 +14,7 @@ import numpy as np
 import polars as pl
 
 from ..algorithms.contract import FloatArray
+from ..recording import rotations
 from ..recording.plugins import plugins
 from .alignment import IntArray, Transform, match, wrap
 from .trajectory import inside
@@ -180,8 +181,6 @@ def _attitude_error(view: RunView, t_ns: IntArray, transform: Transform) -> Floa
     track, reference = view.track, view.reference_track
     if track is None or reference is None or track.quat_wxyz is None or reference.quat_wxyz is None:
         return None
-    from scipy.spatial.transform import Rotation
-
     mine = np.searchsorted(track.t_ns, t_ns)
     right = (
         np.clip(np.searchsorted(reference.t_ns, t_ns), 1, len(reference) - 1)
@@ -190,9 +189,8 @@ def _attitude_error(view: RunView, t_ns: IntArray, transform: Transform) -> Floa
     )
     nearer = np.abs(reference.t_ns[right] - t_ns) <= np.abs(t_ns - reference.t_ns[right - 1])
     theirs = np.where(nearer, right, right - 1)
-    here = Rotation.from_quat(track.quat_wxyz[mine], scalar_first=True)
-    there = Rotation.from_quat(reference.quat_wxyz[theirs], scalar_first=True)
-    error = (here * (Rotation.from_matrix(transform.rotation).inv() * there).inv()).as_rotvec()
+    apart = rotations.product(track.quat_wxyz[mine], rotations.inverse(reference.quat_wxyz[theirs]))
+    error = rotations.rotation_vector(rotations.product(apart, rotations.from_matrix(transform.rotation)))
     if np.degrees(np.linalg.norm(error[0])) > SAME_BODY_DEG:
         return None
     return error
