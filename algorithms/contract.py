@@ -194,13 +194,13 @@ class KernelEstimator(PlainEstimator):
             columns = tuple(f"column_{i}" for i in range(len(message.values)))
         table = pl.DataFrame({c: [v] for c, v in zip(columns, message.values, strict=True)})
         values = self.encode(index, self.channel_index(index, message.channel), table)
-        at = np.zeros(self.max_results, np.int64), np.zeros(self.max_results, np.int64)
+        places = np.zeros(self.max_results, np.int64), np.zeros(self.max_results, np.int64)
         out = np.full((self.max_results, self.width), np.nan)
         channels = np.array([self.channel_index(index, message.channel)])
         count = self.run(
-            self.state, np.array([index]), channels, np.array([message.t_ns], np.int64), values, *at, out
+            self.state, np.array([index]), channels, np.array([message.t_ns], np.int64), values, *places, out
         )
-        return self.results(at[1][:count], out[:count])
+        return self.results(places[1][:count], out[:count])
 
     def channel_index(self, index: int, topic: str) -> int:
         """Return the place of ``topic`` among the channels attached to input ``index``."""
@@ -215,15 +215,15 @@ class KernelEstimator(PlainEstimator):
 
     def results(self, t_ns: IntArray, values: FloatArray) -> list[Result]:
         """Return rows of the result vector as single results."""
-        found: list[Result] = []
+        answers: list[Result] = []
         for when, row in zip(t_ns.tolist(), values, strict=True):
             first = 0
             for output in self.outputs:
                 part = row[first : first + len(output.columns)]
                 first += len(output.columns)
                 if not (np.isnan(part[0]) if output.event else np.isnan(part).all()):
-                    found.append(Result(output.name, when, tuple(part.tolist())))
-        return found
+                    answers.append(Result(output.name, when, tuple(part.tolist())))
+        return answers
 
     def finish(self) -> Iterable[Result] | None:
         """Return the results still held back."""

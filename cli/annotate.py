@@ -251,7 +251,7 @@ def edit(
     from ..recording import changes
 
     rec = recording.open(path)
-    given = {
+    options = {
         "label": label,
         "start_ns": instant(start, rec, "--from"),
         "end_ns": instant(end, rec, "--to"),
@@ -261,7 +261,7 @@ def edit(
         "channel": channel,
         "source": source,
     }
-    values = {k: v for k, v in given.items() if v is not None}
+    values = {k: v for k, v in options.items() if v is not None}
     out = where.target(rec)
     entry = changes.edit(rec, out, ids, values, **where.how)
     return change_outcome(rec, out, entry)
@@ -307,10 +307,10 @@ def import_(
     from ..export.labels import read_labels
 
     rec = recording.open(path)
-    found = read_labels(table, rec, format=format, tier=tier, offset_ns=round(offset * 1e9))
-    for note in found.notes:
+    labels = read_labels(table, rec, format=format, tier=tier, offset_ns=round(offset * 1e9))
+    for note in labels.notes:
         complain(f"{table}: {note}")
-    rows = found.annotations
+    rows = labels.annotations
     if source is not None:
         rows = rows.with_columns(pl.col("source").fill_null(source))
     same = rec.annotations.filter(pl.col("id").is_in(rows["id"].drop_nulls().implode()))["id"].to_list()
@@ -320,7 +320,7 @@ def import_(
         add=rows,
         remove=tuple(same) if replace else (),
         action=f"import {table.name}",
-        more={"format": found.format, "notes": found.notes},
+        more={"format": labels.format, "notes": labels.notes},
     )
 
 
@@ -360,8 +360,8 @@ def export(
     endings = {m.suffix.lower(): name for name, m in WRITTEN.items()} | {".tsv": "events"}
     name = to or endings.get(output.suffix.lower())
     if name is None or name not in endings.values():
-        known = ", ".join(endings.values())
-        raise UsageError(f"{output}: {name or output.suffix!r} is no format of labels; give --to {known}")
+        names = ", ".join(endings.values())
+        raise UsageError(f"{output}: {name or output.suffix!r} is no format of labels; give --to {names}")
     options: dict[str, Any] = {"topics": tuple(TOPIC + t for t in tier)} if tier else {}
     rec = recording.open(path)
     for one in tier:

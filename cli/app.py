@@ -172,10 +172,10 @@ def _run(argv: Sequence[str] | None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
     except (Exception, KeyboardInterrupt) as error:
-        known = expected(error)
-        if known is None:
+        outcome = expected(error)
+        if outcome is None:
             raise
-        line, code = known
+        line, code = outcome
         if as_json and not isinstance(error, KeyboardInterrupt):
             emit_json({"error": line, "exit_code": code})
         complain(line)

@@ -58,7 +58,7 @@ def calibrate(
 
     recordings = [recording.open(path) for path in paths]
     with progress("calibrate", common):
-        found = rp.calibrate(
+        calibrations = rp.calibrate(
             name,
             recordings,
             settings(param, "--param"),
@@ -68,16 +68,18 @@ def calibrate(
             end_ns=instant(end, recordings[0], "--to"),
         )
     written: list[Path] = []
-    for one in found:
+    for one in calibrations:
         if output is not None:
             subject = "_".join(p for p in one.subject.split("/") if p)
             target = (
-                output if len(found) == 1 else output.with_name(f"{output.stem}-{subject}{output.suffix}")
+                output
+                if len(calibrations) == 1
+                else output.with_name(f"{output.stem}-{subject}{output.suffix}")
             )
             rp.save_calibration(one, target, overwrite=force)
             written.append(target)
     lines: list[Heading | TextTable] = []
-    for one in found:
+    for one in calibrations:
         verdict = "" if one.usable else ": NOT USABLE"
         lines.append(Heading(f"{one.kind} of {one.subject or 'the recording'}{verdict}"))
         lines.append(TextTable(["value", "is"], [(key, _shown(value)) for key, value in one.values.items()]))
@@ -85,8 +87,8 @@ def calibrate(
     lines += [Heading(f"written: {path}") for path in written]
     import msgspec
 
-    document = {"calibrations": msgspec.to_builtins(found), "outputs": [str(w) for w in written]}
-    return Outcome(document, lines, DONE if all(c.usable for c in found) else DEFECTS)
+    document = {"calibrations": msgspec.to_builtins(calibrations), "outputs": [str(w) for w in written]}
+    return Outcome(document, lines, DONE if all(c.usable for c in calibrations) else DEFECTS)
 
 
 def _shown(value: object) -> str:

@@ -126,21 +126,21 @@ def check(path: Path, /, *, common: Common = DEFAULT) -> Outcome:
     from ..recording.check import check as examine
 
     rec = recording.open(path)
-    found = [finding_entry(f) for f in examine(rec)]
+    findings = [finding_entry(f) for f in examine(rec)]
     imported, lossy = import_report(rec)
-    if not found and not imported:
+    if not findings and not imported:
         verdict = "nothing is wrong"
     else:
-        verdict = "look at this" if found else "the recording is sound; the raw log was not"
-        if not found and not lossy:
+        verdict = "look at this" if findings else "the recording is sound; the raw log was not"
+        if not findings and not lossy:
             verdict = "nothing is wrong; the import made remarks"
     lines: list[Heading | TextTable] = [Heading(f"{path}: {verdict}")]
-    if found:
-        lines.append(finding_table(found))
+    if findings:
+        lines.append(finding_table(findings))
     if imported:
         lines += [Heading("\nwhat the import found in the raw log"), finding_table(imported)]
-    document = {"path": str(path), "findings": found, "import_findings": imported}
-    return Outcome(document, lines, DEFECTS if found or lossy else DONE)
+    document = {"path": str(path), "findings": findings, "import_findings": imported}
+    return Outcome(document, lines, DEFECTS if findings or lossy else DONE)
 
 
 def say_losses(*recs: Recording) -> None:
@@ -161,7 +161,7 @@ def import_report(rec: Recording) -> tuple[list[dict[str, Any]], bool]:
 
     record = rec.metadata.get("import_report", {})
     try:
-        found = msgspec.json.decode(record.get("findings", "[]"), type=list[Finding])
+        findings = msgspec.json.decode(record.get("findings", "[]"), type=list[Finding])
     except msgspec.MsgspecError:  # another program's record of this name
         return [], False
-    return [finding_entry(f) for f in found], record.get("lossy") == "true"
+    return [finding_entry(f) for f in findings], record.get("lossy") == "true"

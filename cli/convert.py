@@ -96,7 +96,7 @@ def _one(
     with progress(f"convert {paths[0].name}", common, counted=True) as report:
         counter = None if report is None else lambda messages: report(messages, 0)
         made = ingest.convert(paths, output, progress=counter, **options)
-    found = [finding_entry(f) for f in made.report.findings]
+    findings = [finding_entry(f) for f in made.report.findings]
     channels = [
         {"topic": c.topic, "schema": c.schema, "count": c.count, "start_ns": c.start_ns, "end_ns": c.end_ns}
         for c in made.channels
@@ -110,7 +110,7 @@ def _one(
         "format": made.format,
         "channels": channels,
         "also_read": [str(p) for p in made.also_read],
-        "report": {**rows, "findings": found},
+        "report": {**rows, "findings": findings},
     }
     lines: list[Heading | TextTable] = [
         Heading(f"{made.output} ({made.format})"),
@@ -118,7 +118,7 @@ def _one(
         Heading(
             "rows: " + ", ".join(f"{count} {name.removeprefix('rows_')}" for name, count in rows.items())
         ),
-        *([finding_table(found)] if found else []),
+        *([finding_table(findings)] if findings else []),
     ]
     return document, lines, DEFECTS if made.report.lossy else DONE
 
@@ -146,10 +146,10 @@ def _each(paths: tuple[Path, ...], folder: Path, options: dict[str, Any], common
             try:
                 document, shown, code = _one([log], folder / names[log], options, common)
             except Exception as error:
-                known = expected(error)
-                if known is None:
+                outcome = expected(error)
+                if outcome is None:
                     raise
-                line, code = batch.shown(known[0]), known[1]
+                line, code = batch.shown(outcome[0]), outcome[1]
                 complain(line)
                 document, shown = {"output": None, "error": line, "exit_code": code}, []
             conversions.append({"input": batch.shown(log), **document})

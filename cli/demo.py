@@ -174,12 +174,14 @@ def _summary(walks: list[dict[str, Any]]) -> str:
         "",
     ]
     for walk in walks:
-        found = "; ".join(f"{f['kind']} {f['count']} ({f['detail']})" for f in walk["findings"]) or "nothing"
+        findings = (
+            "; ".join(f"{f['kind']} {f['count']} ({f['detail']})" for f in walk["findings"]) or "nothing"
+        )
         names = [m for m in FIGURES if any(m in r["metrics"] for r in walk["runs"])]
         page += [
             f"## {walk['name']}",
             "",
-            f"{walk['log']}: {walk['rows_read']} rows, {walk['length_m']:.1f} m. The import found: {found}.",
+            f"{walk['log']}: {walk['rows_read']} rows, {walk['length_m']:.1f} m. The import found: {findings}.",
             "",
             "| metric | " + " | ".join(r["estimator"] for r in walk["runs"]) + " |",
             "|---|" + "---:|" * len(walk["runs"]),

@@ -77,7 +77,7 @@ def settings(pairs: tuple[str, ...], option: str) -> dict[str, str]:
     """
     from ..recording.errors import UsageError
 
-    found: dict[str, str] = {}
+    values: dict[str, str] = {}
     for pair in pairs:
         key, sign, value = pair.partition("=")
         key = key.strip()
@@ -85,24 +85,24 @@ def settings(pairs: tuple[str, ...], option: str) -> dict[str, str]:
             raise UsageError(
                 f"{option} {pair}: is not of the form key=value, for example {option} rate_hz=100"
             )
-        if found.setdefault(key, value.strip()) != value.strip():
+        if values.setdefault(key, value.strip()) != value.strip():
             raise UsageError(
-                f"{option} {key}: given twice, as {found[key]} and {value.strip()}; give it once"
+                f"{option} {key}: given twice, as {values[key]} and {value.strip()}; give it once"
             )
-    return found
+    return values
 
 
 def limits(pairs: tuple[str, ...], option: str) -> dict[str, float]:
     """Return ``metric=number`` pairs as a dict of numbers; :func:`settings` states the errors."""
     from ..recording.errors import UsageError
 
-    found: dict[str, float] = {}
+    values: dict[str, float] = {}
     for key, value in settings(pairs, option).items():
         try:
-            found[key] = float(value)
+            values[key] = float(value)
         except ValueError:
             raise UsageError(f"{option} {key}={value}: {value!r} is not a number") from None
-    return found
+    return values
 
 
 def instant(text: str | None, rec: Recording, option: str) -> int | None:
@@ -150,16 +150,16 @@ def spans(pairs: tuple[str, ...], rec: Recording, option: str) -> dict[str, list
     """
     from ..recording.errors import UsageError
 
-    found: dict[str, list[tuple[int, int]]] = {}
+    result: dict[str, list[tuple[int, int]]] = {}
     for pair in pairs:
-        topic, given, text = pair.partition("=")
+        topic, separator, text = pair.partition("=")
         begin, colon, length = text.rpartition(":")
-        if not (given and colon and begin and length):
+        if not (separator and colon and begin and length):
             raise UsageError(f"{option} {pair}: write TOPIC=START:LENGTH, such as /phone/gnss=120:60s")
         start = instant(begin, rec, option)
         assert start is not None
-        found.setdefault(topic, []).append((start, start + span_ns(length, option)))
-    return found
+        result.setdefault(topic, []).append((start, start + span_ns(length, option)))
+    return result
 
 
 def span_ns(text: str, option: str) -> int:
@@ -197,10 +197,10 @@ def recordings(paths: Sequence[Path], command: str) -> list[Path]:
 
     if not paths:
         raise UsageError(f"{command}: name a recording or a folder of recordings")
-    found: list[Path] = []
+    result: list[Path] = []
     for path in paths:
         inside = sorted(path.rglob("*.mcap")) if path.is_dir() else [path]
         if not inside:
             raise UsageError(f"{path}: holds no recording (*.mcap); `marcha convert` makes them of raw logs")
-        found += inside
-    return list(dict.fromkeys(found))
+        result += inside
+    return list(dict.fromkeys(result))

@@ -293,8 +293,8 @@ def _over_the_cycle(run: str, joint: dict[str, Any]) -> list[Heading | TextTable
     """Return a joint's angle at every tenth of the gait cycle: mean and standard deviation over the cycles."""
     parts = ("reference", "estimate", "error")
     rows = [
-        [at, *(joint[f"{part}_{what}"][at] for part in parts for what in ("mean", "sd"))]
-        for at in range(0, 101, 10)
+        [percent, *(joint[f"{part}_{what}"][percent] for part in parts for what in ("mean", "sd"))]
+        for percent in range(0, 101, 10)
     ]
     head = f"\n{run}: {joint['joint']} over {joint['count']} gait cycles (from {joint['starts']}), °"
     return [
@@ -305,13 +305,13 @@ def _over_the_cycle(run: str, joint: dict[str, Any]) -> list[Heading | TextTable
 
 def _within(runs: list[dict[str, Any]], tier: str, label: str) -> list[tuple[str, dict[str, Any]]]:
     """Return one column a run and interval of this name; several of one name are numbered."""
-    found = []
+    rows = []
     for run in runs:
         same = [i for i in run["intervals"] if (i["tier"], i["label"]) == (tier, label)]
         for number, interval in enumerate(same, 1):
             name = run["run"] if len(same) == 1 else f"{run['run']} ({number})"
-            found.append((name, interval["metrics"]))
-    return found
+            rows.append((name, interval["metrics"]))
+    return rows
 
 
 def _miss(missed: Any) -> str:

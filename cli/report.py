@@ -39,8 +39,8 @@ def report(
     from ..viz.recording_page import write_page
 
     recs = [recording.open(path) for path in recordings(paths, "report")]
-    with progress("report", common) as said:
-        write_page(recs, output, by=by, picture=not no_picture, overwrite=force, progress=said)
+    with progress("report", common) as advance:
+        write_page(recs, output, by=by, picture=not no_picture, overwrite=force, progress=advance)
     say_losses(*recs)
     document = {"paths": [str(r.path) for r in recs], "output": str(output)}
     return Outcome(document, [Heading(f"wrote {output}")])

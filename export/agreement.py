@@ -102,7 +102,7 @@ def compare(
     )
     overlaps = np.array([share for i, j, share in pairs if _is_interval(a, i) and _is_interval(b, j)])
     agreed, kappa = _kappa(a, b, span)
-    found = Agreement(
+    agreement = Agreement(
         matched=len(pairs),
         missed=len(left),
         added=len(right),
@@ -115,7 +115,7 @@ def compare(
         kappa=kappa,
         agreement=agreed,
     )
-    return found, _listing(a, b, pairs, left, right)
+    return agreement, _listing(a, b, pairs, left, right)
 
 
 def _is_interval(table: pl.DataFrame, row: int) -> bool:

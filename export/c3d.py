@@ -127,7 +127,7 @@ def _encode(
     if analog is not None:
         own = rate_hz(analog.t_ns) or rate
         ratio = max(1, round(own / rate)) if points is not None else 1
-        at = lead.t_ns[0] + np.arange(frames * ratio) * (1e9 / (rate * ratio))
+        sample_ns = lead.t_ns[0] + np.arange(frames * ratio) * (1e9 / (rate * ratio))
         exact = points is None and evenness(analog.t_ns) <= EVEN
         labels, units, values = [], [], []
         for topic, columns in analog.columns.items():
@@ -137,7 +137,7 @@ def _encode(
                 values.append(
                     column
                     if exact
-                    else np.interp(at, analog.t_ns.astype(float), column, left=np.nan, right=np.nan)
+                    else np.interp(sample_ns, analog.t_ns.astype(float), column, left=np.nan, right=np.nan)
                 )
         if values:  # a channel whose messages were lost has none
             file["data"]["analogs"] = np.stack(values)[None]

@@ -140,9 +140,9 @@ def _copy_part(rec: Recording, topics: list[str], options: McapOptions, out: Wri
         if attachment.name in (TABLE, SIDECAR):
             continue  # written anew
         out.add_attachment(attachment.name, rec.attachment(attachment.name), attachment.media_type)
-    known = within(rec.stored_annotations, options)
-    if options.annotations and known.height:
-        out.add_annotations(known)
+    marks = within(rec.stored_annotations, options)
+    if options.annotations and marks.height:
+        out.add_annotations(marks)
 
 
 def _free(name: str, taken: Container[str]) -> str:

@@ -92,15 +92,17 @@ class OpensimExporter:
         return write_files(files, overwrite=overwrite)
 
 
-def _names(options: OpensimOptions, known: list[str]) -> dict[str, str]:
+def _names(options: OpensimOptions, columns: list[str]) -> dict[str, str]:
     """Return the name in the file of each topic, joint or marker; what is not named keeps its own."""
-    given = {}
+    names_given = {}
     for pair in options.names:
         key, sign, value = pair.partition("=")
-        if not sign or not value.strip() or key.strip() not in known:
-            raise UsageError(f"option names: {pair!r}: must be KNOWN=NAME with one of {', '.join(known)}")
-        given[key.strip()] = value.strip()
-    names = {k: given.get(k, "_".join(p for p in k.strip("/").split("/")).replace(" ", "_")) for k in known}
+        if not sign or not value.strip() or key.strip() not in columns:
+            raise UsageError(f"option names: {pair!r}: must be KNOWN=NAME with one of {', '.join(columns)}")
+        names_given[key.strip()] = value.strip()
+    names = {
+        k: names_given.get(k, "_".join(p for p in k.strip("/").split("/")).replace(" ", "_")) for k in columns
+    }
     if len(set(names.values())) != len(names):
         raise UsageError(f"option names: two columns would have one name: {', '.join(names.values())}")
     return names

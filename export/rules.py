@@ -87,14 +87,14 @@ def apply_rules(
         if name not in RULES:
             raise UsageError(f"rule {name!r}: not known; there are {', '.join(RULES)}")
     chosen = names or tuple(RULES)
-    found = by_rules(rec, chosen, selection or Selection())
+    ruled = by_rules(rec, chosen, selection or Selection())
     old = rec.annotations
     key = ["tier", "start_ns", "end_ns", "label"]
-    add = found.join(old, on=key, how="anti", maintain_order="left").select(*COLUMNS)
+    add = ruled.join(old, on=key, how="anti", maintain_order="left").select(*COLUMNS)
     own = pl.any_horizontal(
         pl.lit(False), *(pl.col("source").str.starts_with(_source(n, "")) for n in chosen)
     )
-    stale = old.filter(own.fill_null(False)).join(found, on=key, how="anti")
+    stale = old.filter(own.fill_null(False)).join(ruled, on=key, how="anti")
     if selection is not None and not (selection.whole and not selection.topics):
         stale = stale.clear()  # a part was looked at: what lies elsewhere still holds
     return add, stale["id"].to_list()
@@ -104,17 +104,17 @@ def by_rules(rec: Recording, names: Collection[str], selection: Selection) -> pl
     """Return the annotations of rules, each with its id, by start time."""
     tables = []
     for name in names:
-        for found in RULES[name](rec, selection):
-            if not len(found.start_ns):
+        for marks in RULES[name](rec, selection):
+            if not len(marks.start_ns):
                 continue
-            facts = found.metadata or [{} for _ in found.labels]
+            facts = marks.metadata or [{} for _ in marks.labels]
             tables.append(
-                pl.DataFrame({"start_ns": found.start_ns, "end_ns": found.end_ns}).with_columns(
-                    tier=pl.lit(found.tier),
-                    label=pl.Series(found.labels, dtype=pl.String),
+                pl.DataFrame({"start_ns": marks.start_ns, "end_ns": marks.end_ns}).with_columns(
+                    tier=pl.lit(marks.tier),
+                    label=pl.Series(marks.labels, dtype=pl.String),
                     metadata=pl.Series([msgspec.json.encode(f).decode() for f in facts], dtype=pl.String),
                     source=pl.lit(_source(name, version("marcha"))),
-                    channel=pl.lit(found.channel),
+                    channel=pl.lit(marks.channel),
                 )
             )
     whole = pl.concat(tables) if tables else pl.DataFrame(schema=COLUMNS)
@@ -158,10 +158,10 @@ def stances(rec: Recording, selection: Selection) -> Iterator[Found]:
 
 def swings(rec: Recording, selection: Selection) -> Iterator[Found]:
     """Swings: from the last still sample of a stance to the first of the next, tier ``<run>/swing``."""
-    for found in stances(rec, selection):
-        start, end = found.end_ns[:-1], found.start_ns[1:]
-        tier = f"{found.tier.removesuffix('stance')}swing"
-        yield Found(tier, found.channel, start, end, ["swing"] * len(start))
+    for stance in stances(rec, selection):
+        start, end = stance.end_ns[:-1], stance.start_ns[1:]
+        tier = f"{stance.tier.removesuffix('stance')}swing"
+        yield Found(tier, stance.channel, start, end, ["swing"] * len(start))
 
 
 def steps(rec: Recording, selection: Selection) -> Iterator[Found]:
@@ -249,8 +249,10 @@ def gaps(rec: Recording, selection: Selection) -> Iterator[Found]:
 def _gaps(tier: str, topic: str, t_ns: Times, least_s: float, label: str) -> Found:
     steps = np.diff(t_ns)
     usual = float(np.median(steps)) if len(steps) else 0.0
-    at = np.flatnonzero(steps > max(GAP_TIMES * usual, least_s * 1e9)) if usual > 0 else np.zeros(0, np.intp)
-    return Found(tier, topic, t_ns[at], t_ns[at + 1], [label] * len(at))
+    gap_rows = (
+        np.flatnonzero(steps > max(GAP_TIMES * usual, least_s * 1e9)) if usual > 0 else np.zeros(0, np.intp)
+    )
+    return Found(tier, topic, t_ns[gap_rows], t_ns[gap_rows + 1], [label] * len(gap_rows))
 
 
 def clips(rec: Recording, selection: Selection) -> Iterator[Found]:

@@ -107,22 +107,22 @@ def _sorted(table: pl.DataFrame) -> pl.DataFrame:
 
 def _resampled(own: Times, numbers: dict[str, Floats], t_ns: Times) -> dict[str, Floats]:
     zero = own[0]
-    x, at = (own - zero).astype(float), (t_ns - zero).astype(float)
-    out = {n: np.interp(at, x, v) for n, v in numbers.items() if n not in QUATERNION}
+    x, x_new = (own - zero).astype(float), (t_ns - zero).astype(float)
+    out = {n: np.interp(x_new, x, v) for n, v in numbers.items() if n not in QUATERNION}
     if all(n in numbers for n in QUATERNION):
-        out |= _slerp(x, np.column_stack([numbers[n] for n in QUATERNION]), at)
+        out |= _slerp(x, np.column_stack([numbers[n] for n in QUATERNION]), x_new)
     far = _far(own, t_ns)
     for values in out.values():
         values[far] = np.nan
     return out
 
 
-def _slerp(x: Floats, q: Floats, at: Floats) -> dict[str, Floats]:
+def _slerp(x: Floats, q: Floats, x_new: Floats) -> dict[str, Floats]:
     """Return quaternions at other times (Shoemake 1985)."""
     if len(x) < 2:
-        return {n: np.full(len(at), q[0, i]) for i, n in enumerate(QUATERNION)}
-    k = np.clip(np.searchsorted(x, at, side="right") - 1, 0, len(x) - 2)
-    share = (at - x[k]) / (x[k + 1] - x[k])
+        return {n: np.full(len(x_new), q[0, i]) for i, n in enumerate(QUATERNION)}
+    k = np.clip(np.searchsorted(x, x_new, side="right") - 1, 0, len(x) - 2)
+    share = (x_new - x[k]) / (x[k + 1] - x[k])
     a, b = q[k], q[k + 1]
     dot = np.sum(a * b, axis=1)
     b = np.where(dot[:, None] < 0, -b, b)

@@ -228,14 +228,14 @@ def meaning(schema: str, column: str) -> dict[str, str]:
     if column in COMMON_COLUMNS:
         unit, _, doc = COMMON_COLUMNS[column].partition(", ")
         return {"unit": unit, "meaning": doc}
-    known = SCHEMAS.get(schema)
-    if known is None:
+    registered = SCHEMAS.get(schema)
+    if registered is None:
         return {"unit": "", "meaning": "as the schema of the recording says"}
-    if known.names:
-        fits = [c for c in known.columns if column.endswith(c.name)]
+    if registered.names:
+        fits = [c for c in registered.columns if column.endswith(c.name)]
         best = max(fits, key=lambda c: len(c.name), default=None)
     else:
-        best = next((c for c in known.columns if c.name == column), None)
+        best = next((c for c in registered.columns if c.name == column), None)
     return {"unit": best.unit, "meaning": best.doc} if best else {"unit": "", "meaning": ""}
 
 

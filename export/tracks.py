@@ -187,9 +187,11 @@ class GpxExporter(TrackExporter):
                     out.append(f"<ele>{alt[k]!r}</ele>")
                 if track.times:
                     out.append(f"<time>{track.times[k]}</time>")
-                known = [f"<marcha:{n}>{v[k]!r}</marcha:{n}>" for n, v in sds.items() if math.isfinite(v[k])]
-                if known:
-                    out.append(f"<extensions>{''.join(known)}</extensions>")
+                extensions = [
+                    f"<marcha:{n}>{v[k]!r}</marcha:{n}>" for n, v in sds.items() if math.isfinite(v[k])
+                ]
+                if extensions:
+                    out.append(f"<extensions>{''.join(extensions)}</extensions>")
                 out.append("</trkpt>\n")
             out.append("</trkseg></trk>\n")
         out.append("</gpx>\n")
@@ -245,7 +247,7 @@ class KmlExporter(TrackExporter):
             f"<description>{about}</description>\n"
         ]
         sds = {t.topic: {k: v for k in _SD if (v := _numbers(t.table, k))} for t in tracks}
-        if names := sorted({n for known in sds.values() for n in known}):
+        if names := sorted({n for values_of in sds.values() for n in values_of}):
             fields = "".join(f'<gx:SimpleArrayField name="{n}" type="float"/>' for n in names)
             out.append(f'<Schema id="accuracy">{fields}</Schema>\n')
         for track in tracks:
@@ -262,11 +264,11 @@ class KmlExporter(TrackExporter):
             out += [
                 f"<gx:coord>{x!r} {y!r} {z!r}</gx:coord>\n" for (x, y), z in zip(rows, heights, strict=True)
             ]
-            if known := sds[track.topic]:
+            if values_of := sds[track.topic]:
                 arrays = "".join(
                     f'<gx:SimpleArrayData name="{n}">{"".join(f"<gx:value>{v!r}</gx:value>" for v in values)}'
                     "</gx:SimpleArrayData>"
-                    for n, values in known.items()
+                    for n, values in values_of.items()
                 )
                 out.append(
                     f'<ExtendedData><SchemaData schemaUrl="#accuracy">{arrays}</SchemaData></ExtendedData>\n'

@@ -110,20 +110,20 @@ def _pairs(
         for t in rec.channels
         if t.startswith("/leg/") and t.endswith("/imu") and clocks.get(t) == inertial
     ]
-    found = {}
+    pairs = {}
     for name in names if segment is None else [segment]:
         rates = _optical_rates(rec, clocks, optical, name)
         if rates is not None:
             table = rec.table(f"/leg/{name}/imu")
-            found[name] = Pair(table["t_ns"].to_numpy() * 1e-9, table.select(GYR).to_numpy(), *rates)
-    if not found and segment is None:
-        found = _joint_pairs(rec, clocks, optical, names)
-    if not found:
+            pairs[name] = Pair(table["t_ns"].to_numpy() * 1e-9, table.select(GYR).to_numpy(), *rates)
+    if not pairs and segment is None:
+        pairs = _joint_pairs(rec, clocks, optical, names)
+    if not pairs:
         raise MarchaError(
             f"{source}: no orientation, cluster of three markers {segment or 'SEGMENT'}_… or joint angle on the other "
             "clock to compare with; give --offset or --event"
         )
-    return found
+    return pairs
 
 
 def _optical_rates(
@@ -164,7 +164,7 @@ def _joint_pairs(
         for t, c in rec.channels.items()
         if t.startswith("/reference/") and c.schema == JOINTS and clocks.get(t) == optical
     ]
-    found = {}
+    pairs = {}
     for topic in topics:
         table = rec.table(topic)
         for joint, (upper, lower) in BETWEEN.items():
@@ -184,18 +184,18 @@ def _joint_pairs(
             middle = (0.5 * (t[good][1:] + t[good][:-1]))[near]
             options = [main[0] - main[1], main[0] + main[1]]
             for k, turn in enumerate(options):
-                found[f"{joint} {'+-'[k]}"] = Pair(base, turn[:, None], middle, rate[:, None])
-    if not found:
+                pairs[f"{joint} {'+-'[k]}"] = Pair(base, turn[:, None], middle, rate[:, None])
+    if not pairs:
         return {}
     # The signs of the two main axes are not known: the sum or the difference, whichever agrees better.
     scored = {}
-    for name, pair in found.items():
+    for name, pair in pairs.items():
         try:
             scored[name] = from_rates([pair]).correlation
         except MarchaError:
             continue
-    best = max(scored, key=lambda n: scored[n]) if scored else next(iter(found))
-    return {best.split()[0]: found[best]}
+    best = max(scored, key=lambda n: scored[n]) if scored else next(iter(pairs))
+    return {best.split()[0]: pairs[best]}
 
 
 def _about_main_axis(table: pl.DataFrame, t: FloatArray) -> FloatArray:

@@ -86,9 +86,9 @@ class Anatomy:
     @property
     def legs(self) -> list[str]:
         """Sides of the legs that have landmarks or clusters, empty for markers that name none."""
-        found = {side for side, role in self.landmarks if role not in _OF_TRUNK}
-        found |= {side for side, segment in self.clusters if segment != "trunk"}
-        return [s for s in ("", *SIDES) if s in found]
+        sides = {side for side, role in self.landmarks if role not in _OF_TRUNK}
+        sides |= {side for side, segment in self.clusters if segment != "trunk"}
+        return [s for s in ("", *SIDES) if s in sides]
 
 
 @dataclass
@@ -99,7 +99,7 @@ class ReferenceAngles:
     ----------
     angle, rot : dict
         By joint (``knee``, ``knee_abduction`` …) and by segment.
-    said : dict of str to str
+    remarks : dict of str to str
         Per joint: what it is made of and by which definition.
     doubts : list of str
         What the user must know, a line each.
@@ -107,7 +107,7 @@ class ReferenceAngles:
 
     angle: dict[str, FloatArray] = field(default_factory=dict)
     rot: dict[str, FloatArray] = field(default_factory=dict)
-    said: dict[str, str] = field(default_factory=dict)
+    remarks: dict[str, str] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)
 
 
@@ -115,9 +115,9 @@ def name_of(marker: str) -> tuple[str, str]:
     """Return side (empty: none) and the rest of a marker's name, lower case without separators."""
     words = [w for w in re.split(r"[^a-z0-9]+", marker.rpartition(":")[2].lower()) if w]
     if len(words) > 1:
-        for at in (0, -1):
-            if words[at] in _SIDE:
-                side = _SIDE[words.pop(at)]
+        for position in (0, -1):
+            if words[position] in _SIDE:
+                side = _SIDE[words.pop(position)]
                 return side, "".join(words)
     whole = "".join(words)
     if _known(whole):
@@ -140,14 +140,14 @@ def _cluster_of(rest: str) -> str | None:
     return next((s for word, s in _WORD.items() if rest.startswith(word)), None)
 
 
-def anatomy(names: Sequence[str], given: Mapping[str, str] | None = None) -> Anatomy:
+def anatomy(names: Sequence[str], roles: Mapping[str, str] | None = None) -> Anatomy:
     """Return which marker is which landmark, and which form the cluster of a segment.
 
     Parameters
     ----------
     names : sequence of str
         Markers.
-    given : mapping, optional
+    roles : mapping, optional
         Marker to role as the user says it (``hip``, ``right_knee_lat``); goes before the names.
 
     Raises
@@ -157,7 +157,7 @@ def anatomy(names: Sequence[str], given: Mapping[str, str] | None = None) -> Ana
     """
     landmarks: dict[tuple[str, str], int] = {}
     clusters: dict[tuple[str, str], list[int]] = {}
-    for marker, role in (given or {}).items():
+    for marker, role in (roles or {}).items():
         side, _, plain = role.partition("_") if role.split("_")[0] in SIDES else ("", "", role)
         if marker not in names:
             raise ValueError(f"there is no marker {marker!r}; there are {', '.join(names)}")
@@ -165,7 +165,7 @@ def anatomy(names: Sequence[str], given: Mapping[str, str] | None = None) -> Ana
             raise ValueError(f"{plain!r} is no landmark; there are {', '.join(_ALIASES)}")
         landmarks[side, plain] = list(names).index(marker)
     for k, name in enumerate(names):
-        if name in (given or {}):
+        if name in (roles or {}):
             continue
         side, rest = name_of(name)
         role = _ROLE.get(rest)
@@ -307,7 +307,7 @@ def functional(t: FloatArray, upper: FloatArray, lower: FloatArray, flexes: floa
 
 
 def from_markers(
-    t: FloatArray, names: Sequence[str], pos: FloatArray, definition: str, given: Mapping[str, str]
+    t: FloatArray, names: Sequence[str], pos: FloatArray, definition: str, roles: Mapping[str, str]
 ) -> ReferenceAngles:
     """Return the reference angles that a capture's markers say.
 
@@ -319,7 +319,7 @@ def from_markers(
         Markers (m), NaN where hidden.
     definition : {"isb", "source"}
         See the module.
-    given : mapping
+    roles : mapping
         Marker to landmark, as the user says.
 
     Raises
@@ -327,26 +327,26 @@ def from_markers(
     ValueError
         A given marker or landmark does not exist.
     """
-    known = anatomy(names, given)
-    legs = known.legs
-    found = ReferenceAngles()
-    trunk = _Side(names, pos, known, "")
+    body = anatomy(names, roles)
+    legs = body.legs
+    angles = ReferenceAngles()
+    trunk = _Side(names, pos, body, "")
     if (rot := trunk.trunk_frame()) is not None:
-        found.rot["trunk"] = rot
+        angles.rot["trunk"] = rot
     for side in legs:
         prefix = f"{side}_" if side and len(legs) > 1 else ""
-        _leg(t, _Side(names, pos, known, side), prefix, definition, found)
-    return found
+        _leg(t, _Side(names, pos, body, side), prefix, definition, angles)
+    return angles
 
 
 class _Side:
     """Markers of one leg, with what its clusters carry."""
 
-    def __init__(self, names: Sequence[str], pos: FloatArray, known: Anatomy, side: str) -> None:
-        self.pos, self.known, self.side = pos, known, side
+    def __init__(self, names: Sequence[str], pos: FloatArray, body: Anatomy, side: str) -> None:
+        self.pos, self.body, self.side = pos, body, side
         self.attitude: dict[str, tuple[FloatArray, FloatArray]] = {}
         self.doubts: list[str] = []
-        for (own, segment), places in known.clusters.items():
+        for (own, segment), places in body.clusters.items():
             if own != side and segment != "trunk":
                 continue
             rot, place, _, misfit = cluster_attitude(pos[:, places])
@@ -360,7 +360,7 @@ class _Side:
 
     def mark(self, role: str, segment: str, side: str | None = None) -> FloatArray | None:
         """Return a landmark (n, 3), carried by the segment's cluster where it is hidden."""
-        k = self.known.landmarks.get((self.side if side is None else side, role))
+        k = self.body.landmarks.get((self.side if side is None else side, role))
         if k is None:
             return None
         return (
@@ -395,12 +395,12 @@ class _Side:
         if right is None or left is None or other is None:
             return None
         if low is None:
-            low = 0.5 * sum(self.pos[:, self.known.landmarks[s, "asis"]] for s in SIDES)
+            low = 0.5 * sum(self.pos[:, self.body.landmarks[s, "asis"]] for s in SIDES)
         return frame(0.5 * (left + other) - low, right, along_x=True)
 
 
-def _leg(t: FloatArray, leg: _Side, prefix: str, definition: str, found: ReferenceAngles) -> None:
-    found.doubts += leg.doubts
+def _leg(t: FloatArray, leg: _Side, prefix: str, definition: str, result: ReferenceAngles) -> None:
+    result.doubts += leg.doubts
     hip = leg.mark("hip", "thigh")
     hip = hip if hip is not None else leg.mark("trochanter", "thigh")
     knee, ankle = leg.centre("knee", "thigh"), leg.centre("ankle", "shank")
@@ -412,46 +412,46 @@ def _leg(t: FloatArray, leg: _Side, prefix: str, definition: str, found: Referen
     right: dict[str, FloatArray] = {}
     for joint, segment in (("knee", "thigh"), ("ankle", "shank")):
         if (line := leg.outwards(joint, segment)) is not None:
-            right[segment] = line * _to_the_right(leg, line, bend, found)
+            right[segment] = line * _to_the_right(leg, line, bend, result)
     if hip is not None and knee is not None and "thigh" in right:
-        found.rot[f"{prefix}thigh"] = frame(hip - knee, right["thigh"])
+        result.rot[f"{prefix}thigh"] = frame(hip - knee, right["thigh"])
     lower = right.get("shank", right.get("thigh"))
     if knee is not None and ankle is not None and lower is not None:
-        found.rot[f"{prefix}shank"] = frame(knee - ankle, lower)
+        result.rot[f"{prefix}shank"] = frame(knee - ankle, lower)
     heel, toe = leg.mark("heel", "foot"), leg.mark("toe", "foot")
     if heel is not None and toe is not None and lower is not None:
-        found.rot[f"{prefix}foot"] = frame(np.cross(lower, toe - heel), lower)
+        result.rot[f"{prefix}foot"] = frame(np.cross(lower, toe - heel), lower)
     for joint, (up, low) in JOINTS.items():
         above, below = ("trunk" if up == "trunk" else f"{prefix}{up}"), f"{prefix}{low}"
         name = f"{prefix}{joint}"
-        if above in found.rot and below in found.rot:
+        if above in result.rot and below in result.rot:
             if definition == "isb":
-                angles = cardan(found.rot[above], found.rot[below])
+                angles = cardan(result.rot[above], result.rot[below])
                 for k, tail in enumerate(("", "_abduction", "_rotation")):
-                    found.angle[name + tail] = angles[:, k]
-                found.said[name] = (
+                    result.angle[name + tail] = angles[:, k]
+                result.remarks[name] = (
                     "isb: landmarks, Cardan angles x, y, z (Grood and Suntay 1983), upper - lower"
                 )
             else:
-                upper, lower_rot = found.rot[above], found.rot[below]
-                found.angle[name] = planar(upper[:, :, 2], lower_rot[:, :, 2], upper[:, :, 0])
-                found.said[name] = (
+                upper, lower_rot = result.rot[above], result.rot[below]
+                result.angle[name] = planar(upper[:, :, 2], lower_rot[:, :, 2], upper[:, :, 0])
+                result.remarks[name] = (
                     "source: long axes in the plane across the upper segment's x, upper - lower"
                 )
         elif joint == "knee" and hip is not None and knee is not None and ankle is not None:
             plane = leg.pelvis()
             plane = bend if plane is None and bend is not None else plane
             if plane is not None:
-                found.angle[name] = planar(hip - knee, knee - ankle, np.broadcast_to(plane, knee.shape))
-                found.said[name] = (
+                result.angle[name] = planar(hip - knee, knee - ankle, np.broadcast_to(plane, knee.shape))
+                result.remarks[name] = (
                     "source: lines hip-knee-ankle in the plane across the pelvis, else where they bend, upper - lower"
                 )
         elif joint != "ankle" and up in leg.attitude and low in leg.attitude:
             flexes = -1.0 if joint == "hip" else 1.0
             angle = functional(t, leg.attitude[up][0], leg.attitude[low][0], flexes)
             if angle is not None:
-                found.angle[name] = angle
-                found.said[name] = FUNCTIONAL
+                result.angle[name] = angle
+                result.remarks[name] = FUNCTIONAL
 
 
 FUNCTIONAL = (
@@ -474,7 +474,7 @@ def bent_about(thigh: FloatArray, shank: FloatArray) -> FloatArray | None:
     return mean / np.linalg.norm(mean)
 
 
-def _to_the_right(leg: _Side, line: FloatArray, bend: FloatArray | None, found: ReferenceAngles) -> float:
+def _to_the_right(leg: _Side, line: FloatArray, bend: FloatArray | None, angles: ReferenceAngles) -> float:
     """Return 1 where the line from medial to lateral points to the person's right, else −1."""
     by_name = {"left": -1.0, "right": 1.0}.get(leg.side)
     by_bend = None if bend is None else float(np.sign(np.nansum(line @ bend)))
@@ -482,12 +482,12 @@ def _to_the_right(leg: _Side, line: FloatArray, bend: FloatArray | None, found: 
     by_pelvis = None if pelvis is None else float(np.sign(np.nansum(line * pelvis)))
     if by_name is not None:
         if by_bend is not None and by_bend != by_name:
-            found.doubts.append(
+            angles.doubts.append(
                 f"the {leg.side} knee bends forward by its markers: sides, or medial and lateral, are exchanged"
             )
         return by_name
     sign = by_bend if by_bend is not None else by_pelvis
     if sign is None:
-        found.doubts.append("the leg's side is not known (no bend, no pelvis): taken for the right one")
+        angles.doubts.append("the leg's side is not known (no bend, no pelvis): taken for the right one")
         return 1.0
     return sign or 1.0

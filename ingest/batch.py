@@ -66,7 +66,7 @@ def logs(
     MarchaError
         A path is not there, or an archive is not to be trusted.
     """
-    found: list[Path] = []
+    logs_here: list[Path] = []
     skipped: list[tuple[Path, str]] = []
     archives: dict[Path, Path] = {}
     for path in paths:
@@ -77,7 +77,7 @@ def logs(
             folder = stack.enter_context(unpacked(path, unpack_limit_gb))
             archives[folder] = path
         if not folder.is_dir() or _names(folder, format):
-            found.append(path)
+            logs_here.append(path)
             continue
         inside = []
         for file in sorted(p for p in folder.rglob("*") if p.is_file()):
@@ -88,11 +88,11 @@ def logs(
             else:
                 skipped.append((file, f"not {format}" if format else "no known format"))
         inside = list(dict.fromkeys(inside))
-        found += inside if len(inside) > 1 or folder == path else [path]
-    sides = {(log.parent, f"{log.stem}.truth") for log in found}  # they come along with their log
-    skipped = [(p, why) for p, why in skipped if not any(log in p.parents for log in found)]
+        logs_here += inside if len(inside) > 1 or folder == path else [path]
+    sides = {(log.parent, f"{log.stem}.truth") for log in logs_here}  # they come along with their log
+    skipped = [(p, why) for p, why in skipped if not any(log in p.parents for log in logs_here)]
     skipped = [(p, why) for p, why in skipped if (p.parent, p.name[: p.name.find(".truth") + 6]) not in sides]
-    return LogsFound(list(dict.fromkeys(found)), skipped, archives)
+    return LogsFound(list(dict.fromkeys(logs_here)), skipped, archives)
 
 
 def _names(path: Path, format: str | None) -> list[str]:

@@ -146,12 +146,12 @@ class Cells:
         if comment:
             for i in np.flatnonzero(good & (data[np.minimum(starts, data.size - 1)] == comment[0])).tolist():
                 good[i] = not block[starts[i] : ends[i]].startswith(comment)
-        at = np.flatnonzero(good)
-        if not at.size:
+        complete = np.flatnonzero(good)
+        if not complete.size:
             return pl.DataFrame({"line": pl.Series([], dtype=pl.Int64)})
-        if at.size < ends.size:
+        if complete.size < ends.size:
             block = b"\n".join(
-                block[a:b] for a, b in zip(starts[at].tolist(), ends[at].tolist(), strict=True)
+                block[a:b] for a, b in zip(starts[complete].tolist(), ends[complete].tolist(), strict=True)
             )
         try:
             frame = pl.read_csv(
@@ -165,9 +165,9 @@ class Cells:
             )
         except pl.exceptions.PolarsError:
             frame = None
-        if frame is None or frame.height != at.size:  # a quote that is never closed swallows lines
+        if frame is None or frame.height != complete.size:  # a quote that is never closed swallows lines
             raise MarchaError(
                 f"{self.path}: lines {first_line} … {first_line + ends.size - 1}: a quote does not end "
                 "on its line; remove the quotes"
             )
-        return frame.select(f"c{i}" for i in columns).with_columns(line=pl.Series(at + first_line))
+        return frame.select(f"c{i}" for i in columns).with_columns(line=pl.Series(complete + first_line))

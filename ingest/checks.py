@@ -186,15 +186,15 @@ class SensorCheck:
             low, high, text = self._limits[name]
             if v.max() < high and v.min() > low:
                 continue
-            at = np.flatnonzero((v >= high) | (v <= low))
-            if not at.size:  # a missing cell makes the extremes NaN
+            clipped = np.flatnonzero((v >= high) | (v <= low))
+            if not clipped.size:  # a missing cell makes the extremes NaN
                 continue
             self._clipped.add(name)
             self._report.loss(
                 "clipped",
                 f"{self._subject} {name}: at full scale (±{text}); the true value is beyond it",
-                count=at.size,
-                line=int(lines[at[0]]),
+                count=clipped.size,
+                line=int(lines[clipped[0]]),
                 subject=f"{self._subject} {name}",
             )
 

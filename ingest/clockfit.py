@@ -114,7 +114,7 @@ def from_rates(pairs: Sequence[Pair]) -> ClockFit:
         Too little data or motion, or no agreement.
     """
     coarse = [_Even.of(pair, BANDS_HZ[0]) for pair in pairs]
-    best = max((e.lag() for e in coarse), key=lambda found: found[1])
+    best = max((e.lag() for e in coarse), key=lambda lagged: lagged[1])
     offset = best[0]
     fits = []
     for band in BANDS_HZ:
@@ -191,15 +191,15 @@ def _refine(sides: Sequence[_Even], offset: float, band_hz: float) -> _Fit:
         normal, gradient = np.zeros((2, 2)), np.zeros(2)
         residual, total, count, overlap = 0.0, 0.0, 0, 0.0
         for s in sides:
-            at = s.tb + offset + drift * (s.tb - middle)
-            inside = np.isfinite(s.b).all(axis=1) & (at > s.ta[20]) & (at < s.ta[-20])
+            shifted = s.tb + offset + drift * (s.tb - middle)
+            inside = np.isfinite(s.b).all(axis=1) & (shifted > s.ta[20]) & (shifted < s.ta[-20])
             if inside.sum() < LEAST_S * RATE_HZ:
                 raise MarchaError(
                     f"alignment: the two overlap by less than {LEAST_S:g} s: no common motion in time"
                 )
             overlap = max(overlap, float(inside.sum() / RATE_HZ))
-            now = _at(at[inside], s.ta, s.a)
-            rise = _at(at[inside], s.ta, s.slope)
+            now = _at(shifted[inside], s.ta, s.a)
+            rise = _at(shifted[inside], s.ta, s.slope)
             y = np.column_stack((s.b[inside], np.ones(inside.sum())))
             # What A and b can explain is taken out of the residual and of the slopes (variable projection).
             lever = rise * (s.tb[inside] - middle)[:, None]

@@ -239,25 +239,25 @@ def careful_block(
         )
         comma = value.is_null() & dotted.is_not_null()
         if comma.any():
-            at = int(comma.arg_true()[0])
+            first = int(comma.arg_true()[0])
             report.repair(
                 "decimal_comma",
-                f"{name}: {text[at]!r} is read as {dotted[at]:g}",
+                f"{name}: {text[first]!r} is read as {dotted[first]:g}",
                 count=int(comma.sum()),
-                line=block["line"][at],
+                line=block["line"][first],
                 subject=name,
             )
             value = value.fill_null(dotted)
             columns[name] = value.fill_null(math.nan)
-        given = text.is_not_null() & ~text.str.to_lowercase().is_in(MISSING)
-        odd = given & value.is_null()
+        filled = text.is_not_null() & ~text.str.to_lowercase().is_in(MISSING)
+        odd = filled & value.is_null()
         if odd.any():
-            at = int(odd.arg_true()[0])
+            first = int(odd.arg_true()[0])
             report.repair(
                 "missing_cell",
-                f"{name}: {text[at]!r} is not a number: taken as missing",
+                f"{name}: {text[first]!r} is not a number: taken as missing",
                 count=int(odd.sum()),
-                line=block["line"][at],
+                line=block["line"][first],
                 subject=f"{name} unreadable",
             )
     return pl.DataFrame(columns)
@@ -273,12 +273,12 @@ def with_ticks(
     t = frame[name] * factor
     far = t.abs() > limit
     if far.any():
-        at = int(far.arg_true()[0])
+        first = int(far.arg_true()[0])
         report.drop(
             "bad_row",
-            f"{name}: {frame[name][at]:g} is beyond any clock; row dropped",
+            f"{name}: {frame[name][first]:g} is beyond any clock; row dropped",
             count=int(far.sum()),
-            line=frame["line"][at],
+            line=frame["line"][first],
         )
         frame, t = frame.filter(~far), t.filter(~far)
     return frame.with_columns(t=t.round().cast(pl.Int64))
@@ -298,11 +298,11 @@ def _with_number(block: pl.DataFrame, place: str, name: str, report: ReportBuild
     bad = _numbers(block[place]).is_null()
     if not bad.any():
         return block
-    at = int(bad.arg_true()[0])
+    first = int(bad.arg_true()[0])
     report.drop(
         "bad_row",
-        f"{name}: {block[place][at]!r} is not a number; row dropped",
+        f"{name}: {block[place][first]!r} is not a number; row dropped",
         count=int(bad.sum()),
-        line=block["line"][at],
+        line=block["line"][first],
     )
     return block.filter(~bad)

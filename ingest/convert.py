@@ -126,30 +126,30 @@ def convert(
     if out.exists() and not overwrite:
         raise OutputExists(out)
     with contextlib.ExitStack() as stack:
-        found = registry.choose(
+        recognised = registry.choose(
             sources, format, stack, mapped=mapped, unpack_limit_gb=unpack_limit(options or {})
         )
-        settings = registry.share_options(found, chosen)
+        settings = registry.share_options(recognised, chosen)
         floor_report = ReportBuilder()
         floor = read_floor(beside, place, floor_report)
         floor.attachments += read_underlay(under)
         beside += under
-        side_files = [read_truth(source.files[0]) for source in found]
+        side_files = [read_truth(source.files[0]) for source in recognised]
         facts = {
-            "importer": ", ".join(dict.fromkeys(r.importer.name for r, _ in found)),
-            "importer_version": ", ".join(dict.fromkeys(r.source for r, _ in found)),
+            "importer": ", ".join(dict.fromkeys(r.importer.name for r, _ in recognised)),
+            "importer_version": ", ".join(dict.fromkeys(r.source for r, _ in recognised)),
             "options": chosen | facts_of_walk | {f"plan.{k}": v for k, v in place.items()},
             "given": ", ".join(as_unicode(p.name) for p in (*sources, *beside)),
         }
         read = [
-            p for (_, files), side in zip(found, side_files, strict=True) for p in _read(files, side)
+            p for (_, files), side in zip(recognised, side_files, strict=True) for p in _read(files, side)
         ] + beside
         origin = stack.enter_context(helpers("hash", 1)).submit(provenance, read, **facts)
         try:
             with mr.create(out, overwrite=overwrite) as recording:
-                merged = _Merged(len(found), floor, facts_of_walk)
+                merged = _Merged(len(recognised), floor, facts_of_walk)
                 written = _Writer(recording, progress)
-                for source, setting, side in zip(found, settings, side_files, strict=True):
+                for source, setting, side in zip(recognised, settings, side_files, strict=True):
                     imported = source.registered.importer.read(source.files, setting)
                     if strict:
                         imported.refuse_changes(source.files[0])
@@ -213,8 +213,8 @@ class _Merged:
         if imported.annotations is not None:
             self.annotations.append(written.moved(imported.annotations))
         raw = _raw(source.files) if options.keep_source else ()
-        given = {a.name for a in self.attachments}  # what the user names beside a log goes before its own
-        self.attachments += [a for a in (*imported.attachments, *raw) if a.name not in given]
+        names = {a.name for a in self.attachments}  # what the user names beside a log goes before its own
+        self.attachments += [a for a in (*imported.attachments, *raw) if a.name not in names]
 
     def report(self, floor: Report) -> Report:
         """Return the report of all sources; of several a finding names its file. ``floor`` is that of the plan."""
@@ -347,13 +347,13 @@ def unpack_limit(chosen: Mapping[str, Any]) -> float:
 def _instant(option: str, text: str) -> int:
     """Return an ISO 8601 time as ns since 1970, UTC where it names no zone."""
     try:
-        at = datetime.fromisoformat(text)
+        moment = datetime.fromisoformat(text)
     except ValueError:
         raise UsageError(
             f"option {option}={text!r} is no ISO 8601 time, such as 2026-11-21T10:00:00Z"
         ) from None
-    at = at if at.tzinfo else at.replace(tzinfo=UTC)
-    since = at - datetime(1970, 1, 1, tzinfo=UTC)
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
     nanoseconds = (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1000
     if nanoseconds < 0:
         raise UsageError(f"option {option}={text!r} lies before 1970")

@@ -47,17 +47,17 @@ class TableHeader:
 
     def roles(self, roles: Roles, named: Mapping[str, str] | None = None) -> dict[str, int]:
         """Return the place of each role that the header has; ``named`` (role to name) goes first."""
-        found: dict[str, int] = {}
+        columns: dict[str, int] = {}
         for role, name in (named or {}).items():
             if role in roles and name in self.names:
-                found[role] = self.names.index(name)
+                columns[role] = self.names.index(name)
         for i, name in enumerate(self.names):
-            if i not in found.values():
+            if i not in columns.values():
                 bare = plain(name)
-                role = next((r for r, p in roles.items() if r not in found and re.fullmatch(p, bare)), None)
+                role = next((r for r, p in roles.items() if r not in columns and re.fullmatch(p, bare)), None)
                 if role is not None:
-                    found[role] = i
-        return found
+                    columns[role] = i
+        return columns
 
 
 def plain(name: str) -> str:
@@ -86,13 +86,13 @@ def named_columns(text: str) -> dict[str, str]:
     UsageError
         It is not written so.
     """
-    found: dict[str, str] = {}
+    columns: dict[str, str] = {}
     for part in filter(None, (p.strip() for p in text.split(","))):
         role, equals, name = part.partition("=")
         if not equals:
             raise UsageError(f"columns: {part!r} is not role=name, such as time=ts,rssi=level")
-        found[role.strip()] = name.strip()
-    return found
+        columns[role.strip()] = name.strip()
+    return columns
 
 
 def read_cells(
@@ -144,21 +144,21 @@ def numbers(cells: pl.DataFrame, roles: tuple[str, ...], path: Path, report: Rep
         empty = text == ""
         broken = (value.is_null() & ~empty).to_numpy()
         if empty.any():
-            at = int(empty.arg_true()[0])
+            first = int(empty.arg_true()[0])
             report.note(
                 "missing_cell",
                 f"{path.name} {role}: no value",
                 count=int(empty.sum()),
-                line=cells["line"][at],
+                line=cells["line"][first],
                 subject=f"{path.name} {role} empty",
             )
         if broken.any():
-            at = int(np.flatnonzero(broken)[0])
+            first = int(np.flatnonzero(broken)[0])
             report.repair(
                 "missing_cell",
-                f"{path.name} {role}: {text[at]!r} is no number: no value",
+                f"{path.name} {role}: {text[first]!r} is no number: no value",
                 count=int(broken.sum()),
-                line=cells["line"][at],
+                line=cells["line"][first],
                 subject=f"{path.name} {role}",
             )
         cells = cells.with_columns(value.fill_null(np.nan).alias(role))
@@ -258,12 +258,12 @@ def times_ns(cells: pl.DataFrame, unit: TimeUnit, path: Path, report: ReportBuil
         t = pl.select(pl.when(plainly & ~text.str.starts_with("-")).then(exact).otherwise(rough)).to_series()
     lost = t.is_null()
     if lost.any():
-        at = int(lost.arg_true()[0])
+        first = int(lost.arg_true()[0])
         report.drop(
             "bad_row",
-            f"{path.name}: time {text[at]!r} cannot be read; row dropped",
+            f"{path.name}: time {text[first]!r} cannot be read; row dropped",
             count=int(lost.sum()),
-            line=cells["line"][at],
+            line=cells["line"][first],
             subject=f"{path.name} time",
         )
     return cells.with_columns(t.alias("t_ns")).filter(~lost).drop("time")

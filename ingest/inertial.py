@@ -66,7 +66,7 @@ def x_io_columns(path: Path, names: Sequence[str], line: int) -> dict[str, Sourc
     MarchaError
         The unit of an acceleration, angular rate or time is unknown.
     """
-    found: dict[str, SourceColumn] = {}
+    columns: dict[str, SourceColumn] = {}
     for name in names:
         match = _CELL.fullmatch(name)
         if match is None:
@@ -87,8 +87,8 @@ def x_io_columns(path: Path, names: Sequence[str], line: int) -> dict[str, Sourc
             raise MarchaError(
                 f"{path}, line {line}: column {name!r}: {error}; or import it with --map"
             ) from None
-        found[column] = SourceColumn(name, scale)
-    return found
+        columns[column] = SourceColumn(name, scale)
+    return columns
 
 
 @dataclass(frozen=True)
@@ -288,9 +288,9 @@ class Plateau:
                 before, count, line = self._ends.get((axis, sign), (-np.inf, 0, 0))
                 if not extreme >= before:
                     continue
-                at = np.flatnonzero(sign * v == extreme)
-                count, line = (count, line) if extreme == before else (0, int(lines[at[0]]))
-                self._ends[axis, sign] = (extreme, count + at.size, line)
+                extremes = np.flatnonzero(sign * v == extreme)
+                count, line = (count, line) if extreme == before else (0, int(lines[extremes[0]]))
+                self._ends[axis, sign] = (extreme, count + extremes.size, line)
 
     def finish(self) -> None:
         """Report ``clipped`` for every extreme that looks like a full scale."""

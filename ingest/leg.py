@@ -120,10 +120,10 @@ def rotations(
         if topic in wanted:
             table, lost = sign_free(table)
             if lost.any():
-                at = int(np.argmax(lost))
+                first = int(np.argmax(lost))
                 report.note(
                     "no_rotation",
-                    f"{topic}: no orientation here, from {table['t_ns'][at] * 1e-9:.3f} s on: no message",
+                    f"{topic}: no orientation here, from {table['t_ns'][first] * 1e-9:.3f} s on: no message",
                     count=int(lost.sum()),
                     subject=topic,
                 )

@@ -70,10 +70,10 @@ class LegWatch:
         _swapped(sensors, builder)
         if encoder is not None:
             _encoder(sensors, encoder, self._specs["/leg/encoder"].metadata, builder)
-        found: list[Finding] = builder.build().findings
-        if not found:
+        findings: list[Finding] = builder.build().findings
+        if not findings:
             return report
-        order = sorted([*report.findings, *found], key=lambda f: (f.kind, f.first_line or -1))
+        order = sorted([*report.findings, *findings], key=lambda f: (f.kind, f.first_line or -1))
         return msgspec.structs.replace(report, findings=order, lossy=report.lossy or builder.build().lossy)
 
 
@@ -119,10 +119,10 @@ def _silent(topic: str, sensor: _Sensor, report: ReportBuilder) -> None:
     steps = np.diff(sensor.t)
     long = np.flatnonzero(steps > max(SILENT_S, SILENT_INTERVALS * sensor.step))
     if long.size:
-        at = int(long[np.argmax(steps[long])])
+        longest = int(long[np.argmax(steps[long])])
         report.loss(
             "sensor_gap",
-            f"{topic}: no readings for {steps[at]:.3g} s from {sensor.t[at]:.3f} s on (the longest); nothing "
+            f"{topic}: no readings for {steps[longest]:.3g} s from {sensor.t[longest]:.3f} s on (the longest); nothing "
             "is filled in",
             count=long.size,
             subject=topic,
@@ -281,14 +281,14 @@ def unwrapped(
             last[key] = float(raw[-1])
             shift = turns.get(key, 0.0) + np.cumsum(jumps)
             turns[key] = float(shift[-1])
-            at = np.flatnonzero(jumps)
-            if at.size:
-                when = table["t_ns"][int(good[at[0]])] * 1e-9
+            jumped = np.flatnonzero(jumps)
+            if jumped.size:
+                when = table["t_ns"][int(good[jumped[0]])] * 1e-9
                 report.repair(
                     "angle_wrap",
-                    f"{topic} {name}: jumps by {np.degrees(steps[at[0]]):.0f}° at {when:.3f} s: goes on without "
+                    f"{topic} {name}: jumps by {np.degrees(steps[jumped[0]]):.0f}° at {when:.3f} s: goes on without "
                     "the turn",
-                    count=at.size,
+                    count=jumped.size,
                     rows=int(np.count_nonzero(shift)),
                     subject=f"{topic} {name}",
                 )

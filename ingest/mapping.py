@@ -240,14 +240,14 @@ def targets(path: Path, mapping: Mapping, index: int, topic: Topic) -> list[Targ
         )
     if not topic.columns:
         raise MarchaError(f"{where}.columns: at least one column is needed")
-    found = []
-    for name, given in topic.columns.items():
+    result = []
+    for name, entry in topic.columns.items():
         key = f"{where}.columns.{name}"
-        cell = given if isinstance(given, CellSource) else CellSource(column=given)
+        cell = entry if isinstance(entry, CellSource) else CellSource(column=entry)
         column = _column(name, schema.columns, bool(schema.names))
         if column is None:
-            known = ", ".join(c.name or "<name>" for c in schema.columns)
-            raise MarchaError(f"{key}: {schema.name} has no column {name!r}; it has {known}")
+            columns = ", ".join(c.name or "<name>" for c in schema.columns)
+            raise MarchaError(f"{key}: {schema.name} has no column {name!r}; it has {columns}")
         if (cell.column is None) == (cell.constant is None):
             raise MarchaError(f"{key}: give either column or constant")
         if isinstance(cell.column, str) and not mapping.layout.header:
@@ -267,7 +267,7 @@ def targets(path: Path, mapping: Mapping, index: int, topic: Topic) -> list[Targ
             raise MarchaError(f"{key}.constant: {cell.constant!r} is not a number")
         limit = abs(topic.full_scale[group] * factor) if group in topic.full_scale else None
         offset = offset * cell.scale + cell.offset
-        found.append(Target(name, cell.column, cell.constant, kind, factor * cell.scale, offset, limit))
+        result.append(Target(name, cell.column, cell.constant, kind, factor * cell.scale, offset, limit))
     groups = [g for g in schema.groups if not g.optional and not schema.names]
     for needed in (c.name for g in groups for c in g.columns):
         if needed not in topic.columns:
@@ -279,7 +279,7 @@ def targets(path: Path, mapping: Mapping, index: int, topic: Topic) -> list[Targ
             raise MarchaError(
                 f"{where}.columns: {lacking} is missing beside {have[0]}; give a column or a constant"
             )
-    return found
+    return result
 
 
 def _column(name: str, columns: tuple[Column, ...], named: bool) -> Column | None:

@@ -49,7 +49,7 @@ def read_mat(path: Path, names: set[str] | None = None) -> dict[str, Variable]:
     if not data.startswith(MAGIC) or data[126:128] not in (b"IM", b"MI"):
         raise MarchaError(f"{path}: not a readable MATLAB file: it does not begin with {MAGIC.decode()!r}")
     order = "<" if data[126:128] == b"IM" else ">"
-    found: dict[str, Variable] = {}
+    variables: dict[str, Variable] = {}
     try:
         for kind, body in _elements(memoryview(data)[128:], order):
             matrix = body
@@ -58,10 +58,10 @@ def read_mat(path: Path, names: set[str] | None = None) -> dict[str, Variable]:
             elif kind != _MATRIX:
                 continue
             variable = _variable(matrix, order, names)
-            found[variable.name] = variable
+            variables[variable.name] = variable
     except (_Damaged, zlib.error) as error:
         raise MarchaError(f"{path}: a damaged MATLAB file: {error}; copy or save it again") from None
-    return found
+    return variables
 
 
 class _Damaged(Exception):
@@ -69,26 +69,26 @@ class _Damaged(Exception):
 
 
 def _elements(data: memoryview, order: str) -> Iterator[tuple[int, memoryview]]:
-    at = 0
-    while at + 8 <= len(data):
-        kind, size, start, end = _tag(data, at, order)
+    offset = 0
+    while offset + 8 <= len(data):
+        kind, size, start, end = _tag(data, offset, order)
         yield kind, data[start : start + size]
-        at = end if kind != _COMPRESSED else start + size  # compressed elements are not padded
-    if any(data[at:]):
-        raise _Damaged(f"{len(data) - at} bytes behind its last variable")
+        offset = end if kind != _COMPRESSED else start + size  # compressed elements are not padded
+    if any(data[offset:]):
+        raise _Damaged(f"{len(data) - offset} bytes behind its last variable")
 
 
-def _tag(data: memoryview, at: int, order: str) -> tuple[int, int, int, int]:
+def _tag(data: memoryview, offset: int, order: str) -> tuple[int, int, int, int]:
     """Return type, size, start of the data and start of the next element."""
-    if at + 8 > len(data):
+    if offset + 8 > len(data):
         raise _Damaged("it ends in the middle of a variable")
-    first, second = (int(v) for v in np.frombuffer(data[at : at + 8], f"{order}u4"))
+    first, second = (int(v) for v in np.frombuffer(data[offset : offset + 8], f"{order}u4"))
     if first >> 16:  # a small element: size and type in one word
-        kind, size, start, end = first & 0xFFFF, first >> 16, at + 4, at + 8
+        kind, size, start, end = first & 0xFFFF, first >> 16, offset + 4, offset + 8
         if size > 4:
             raise _Damaged("a small element of more than 4 bytes")
     else:
-        kind, size, start = first, second, at + 8
+        kind, size, start = first, second, offset + 8
         end = start + (size + 7) // 8 * 8
     if start + size > len(data):
         raise _Damaged("it ends in the middle of a variable")
@@ -110,20 +110,20 @@ def _inflated(body: memoryview, order: str) -> memoryview:
 
 
 def _variable(data: memoryview, order: str, names: set[str] | None) -> Variable:
-    kind, size, start, at = _tag(data, 0, order)
+    kind, size, start, offset = _tag(data, 0, order)
     if kind != 6 or size != 8:
         raise _Damaged("a variable without flags")
     flags = int(np.frombuffer(data[start : start + 4], f"{order}u4")[0])
-    kind, size, start, at = _tag(data, at, order)
+    kind, size, start, offset = _tag(data, offset, order)
     if kind != 5 or size % 4:
         raise _Damaged("a variable without dimensions")
     shape = tuple(int(n) for n in np.frombuffer(data[start : start + size], f"{order}i4"))
-    kind, size, start, at = _tag(data, at, order)
+    kind, size, start, offset = _tag(data, offset, order)
     name = bytes(data[start : start + size]).decode("utf-8", "replace")
     numeric = (flags & 0xFF) in _NUMERIC and not flags & 0x0800 and all(n >= 0 for n in shape)
     if not numeric or names is None or name not in names:
         return Variable(name, shape, None)
-    kind, size, start, at = _tag(data, at, order)
+    kind, size, start, offset = _tag(data, offset, order)
     if kind not in _TYPES:
         raise _Damaged(f"variable {name!r} has values of the unknown type {kind}")
     dtype = np.dtype(order + _TYPES[kind])

@@ -95,12 +95,12 @@ def float_rows(
             value = pl.select(pl.when(value.is_finite()).then(value)).to_series()
             odd = cell.is_not_null() & value.is_null() & ~cell.str.to_lowercase().is_in(MISSING)
             if k and odd.any():
-                at = int(odd.arg_true()[0])
+                first = int(odd.arg_true()[0])
                 report.repair(
                     "missing_cell",
-                    f"{name}: {cell[at]!r} is not a number: taken as missing",
+                    f"{name}: {cell[first]!r} is not a number: taken as missing",
                     count=int(odd.sum()),
-                    line=int(line[good[at]]),
+                    line=int(line[good[first]]),
                     subject=f"{name} unreadable",
                 )
             columns.append(value.fill_null(np.nan).to_numpy())
@@ -109,12 +109,12 @@ def float_rows(
         bad[good[without]] = True
         values, good = values[~without], good[~without]
     if bad.any():
-        at = int(np.argmax(bad))
+        first = int(np.argmax(bad))
         report.drop(
             "bad_row",
-            f"{lines[at][:40]!r}: not {width} cells that begin with a number; row dropped",
+            f"{lines[first][:40]!r}: not {width} cells that begin with a number; row dropped",
             count=int(bad.sum()),
-            line=int(line[at]),
+            line=int(line[first]),
         )
     if not good.size:
         raise MarchaError(f"{path}: no row of numbers behind its header; nothing to convert")
@@ -242,7 +242,7 @@ def angle_channels(
     """Return ``/reference/optical/joint`` and ``…/<segment>/orientation`` as far as the markers say them."""
     if options.angles == "off":
         return []
-    given = {}
+    roles = {}
     for pair in (options.landmarks or "").replace(" ", "").split(","):
         marker, colon, role = pair.partition(":")
         if pair and not colon:
@@ -250,52 +250,52 @@ def angle_channels(
                 f"option landmarks: {pair!r} is no MARKER:LANDMARK pair, such as RLE:right_knee_lat"
             )
         if pair:
-            given[marker] = role
+            roles[marker] = role
     seen = np.where((pos == 0).all(axis=2, keepdims=True), np.nan, pos)
     try:
-        found = from_markers(t_ns.astype(np.float64) * 1e-9, names, seen, options.angles, given)
+        angles = from_markers(t_ns.astype(np.float64) * 1e-9, names, seen, options.angles, roles)
     except ValueError as error:
         raise UsageError(f"option landmarks: {error}") from None
-    for doubt in found.doubts:
+    for doubt in angles.doubts:
         report.note("reference_doubt", doubt, subject=doubt)
     if options.side is not None:
         start = f"{options.side}_"
-        found = ReferenceAngles(
-            angle={name.removeprefix(start): v for name, v in found.angle.items()},
-            rot={name.removeprefix(start): v for name, v in found.rot.items()},
-            said={name.removeprefix(start): v for name, v in found.said.items()},
+        angles = ReferenceAngles(
+            angle={name.removeprefix(start): v for name, v in angles.angle.items()},
+            rot={name.removeprefix(start): v for name, v in angles.rot.items()},
+            remarks={name.removeprefix(start): v for name, v in angles.remarks.items()},
         )
-    return reference_channels(found, report)
+    return reference_channels(angles, report)
 
 
 def reference_channels(
-    found: ReferenceAngles, report: ReportBuilder
+    angles: ReferenceAngles, report: ReportBuilder
 ) -> list[tuple[ChannelSpec, pl.DataFrame]]:
     """Return the channels of reference angles and attitudes, and say by which definition they are."""
     from scipy.spatial.transform import Rotation
 
     channels = []
-    if found.angle:
-        table = pl.DataFrame(found.angle)
-        metadata = {"sign": "upper - lower segment", **found.said}
+    if angles.angle:
+        table = pl.DataFrame(angles.angle)
+        metadata = {"sign": "upper - lower segment", **angles.remarks}
         channels.append((ChannelSpec(ANGLES_TOPIC, JOINTS, "", tuple(table.columns), metadata), table))
-        for name, said in found.said.items():
-            lost = 100.0 * float(np.mean(~np.isfinite(found.angle[name])))
+        for name, loss in angles.remarks.items():
+            lost = 100.0 * float(np.mean(~np.isfinite(angles.angle[name])))
             report.note(
                 "reference_angle",
-                f"{ANGLES_TOPIC} {name}: {said}; {lost:.2g} % of the frames without",
+                f"{ANGLES_TOPIC} {name}: {loss}; {lost:.2g} % of the frames without",
                 subject=name,
             )
-    for segment, rot in found.rot.items():
+    for segment, rot in angles.rot.items():
         quat = np.full((len(rot), 4), np.nan)
         good = np.isfinite(rot).all(axis=(1, 2))
         if good.any():
             quat[good] = Rotation.from_matrix(rot[good]).as_quat(canonical=True, scalar_first=True)
         table = pl.DataFrame({c: quat[:, k] for k, c in enumerate(QUAT)})
-        said = {"frame": "x right, y forward, z up along the segment, from landmarks (docs/joints.md)"}
+        loss = {"frame": "x right, y forward, z up along the segment, from landmarks (docs/joints.md)"}
         channels.append(
             (
-                ChannelSpec(f"/reference/optical/{segment}/orientation", ORIENTATION, "optical", QUAT, said),
+                ChannelSpec(f"/reference/optical/{segment}/orientation", ORIENTATION, "optical", QUAT, loss),
                 table,
             )
         )

@@ -53,24 +53,24 @@ def axis_of(text: str) -> FloatArray:
     if plain.lstrip("-") in ("x", "y", "z"):
         return (-1.0 if plain.startswith("-") else 1.0) * np.eye(3)["xyz".index(plain[-1])]
     try:
-        found = np.array([float(part) for part in plain.split(",")])
+        axis = np.array([float(part) for part in plain.split(",")])
     except ValueError:
-        found = np.zeros(0)
-    if found.shape != (3,) or not np.linalg.norm(found) > 0:
+        axis = np.zeros(0)
+    if axis.shape != (3,) or not np.linalg.norm(axis) > 0:
         raise UsageError(f"option flexion_axis={text!r}: must be x, -x … or three numbers such as 0.1,0.9,0")
-    return found / np.linalg.norm(found)
+    return axis / np.linalg.norm(axis)
 
 
 def joints_of(topics: Iterable[str]) -> dict[str, tuple[str, str]]:
     """Return the joints whose two segments have orientations: name to upper and lower topic."""
     have = {t.split("/")[-2]: t for t in topics if t.endswith("/orientation")}
-    found = {}
+    joints = {}
     for prefix in ("", *(f"{side}_" for side in SIDES)):
         for joint, (up, low) in JOINTS.items():
             above = up if prefix + up not in have else prefix + up
             if above in have and prefix + low in have:
-                found[prefix + joint] = have[above], have[prefix + low]
-    return found
+                joints[prefix + joint] = have[above], have[prefix + low]
+    return joints
 
 
 def with_angles(
@@ -120,8 +120,8 @@ def _behind(
             if axis is not None:
                 angle = twist(upper, lower, axis)
             else:
-                found = functional(t_ns * 1e-9, upper, lower, -1.0 if name.endswith("hip") else 1.0)
-                angle = angle if found is None else found
+                fitted = functional(t_ns * 1e-9, upper, lower, -1.0 if name.endswith("hip") else 1.0)
+                angle = angle if fitted is None else fitted
             report.note("reference_angle", f"{own} {name}: {how}", subject=name)
         angles[name] = angle
     yield own, pl.DataFrame({"t_ns": t_ns, **angles})

@@ -300,8 +300,8 @@ class Stream:
         values = np.column_stack([table[c].to_numpy() for c in table.columns[2:]])
         before = self._last.get(part.topic)
         first = values[:1] + 1 if before is None else before
-        known = np.nan_to_num(values, nan=-9e9)
-        same = (np.diff(known, axis=0, prepend=np.nan_to_num(first, nan=-9e9)) == 0).all(axis=1)
+        readings = np.nan_to_num(values, nan=-9e9)
+        same = (np.diff(readings, axis=0, prepend=np.nan_to_num(first, nan=-9e9)) == 0).all(axis=1)
         self._last[part.topic] = values[-1:]
         if same.any():
             what = "fix" if part.fixes else "reading"

@@ -39,9 +39,9 @@ def address(text: str) -> str:
 
 def local_address(text: str) -> str:
     """Return an address, or for a name that is none a locally administered one made of it (``A`` and so on)."""
-    found = address(text)
-    if found:
-        return found
+    mac = address(text)
+    if mac:
+        return mac
     from hashlib import blake2b
 
     digits = "02" + blake2b(text.strip().lower().encode(), digest_size=5).hexdigest()
@@ -115,8 +115,8 @@ class RadioWatch:
                 "as hotspots move and are no anchors (further networks of one access point look alike)",
                 count=int(hotspots["len"].sum()),
             )
-        found = builder.build().findings
-        order = sorted([*report.findings, *found], key=lambda f: (f.kind, f.first_line or -1))
+        findings = builder.build().findings
+        order = sorted([*report.findings, *findings], key=lambda f: (f.kind, f.first_line or -1))
         return msgspec.structs.replace(report, findings=order)
 
 

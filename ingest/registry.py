@@ -89,17 +89,17 @@ class Candidate(msgspec.Struct, frozen=True):
 @cache
 def importers() -> dict[str, Registered]:
     """Return all importers by name; a broken plug-in is a warning with its name."""
-    found: dict[str, Registered] = {}
+    result: dict[str, Registered] = {}
     for plugin in plugins(entry_points, GROUP, "importer", _checked).values():
         name = plugin.part.name
-        if name in found:
+        if name in result:
             warnings.warn(
-                f"importer plug-in {name} ({plugin.source}) is left out: {found[name].source} has the name already",
+                f"importer plug-in {name} ({plugin.source}) is left out: {result[name].source} has the name already",
                 stacklevel=2,
             )
             continue
-        found[name] = Registered(plugin.part, plugin.source)
-    return found
+        result[name] = Registered(plugin.part, plugin.source)
+    return result
 
 
 def get(name: str) -> Registered:
@@ -110,11 +110,11 @@ def get(name: str) -> Registered:
     UsageError
         There is none of that name.
     """
-    known = importers()
-    if name not in known:
+    registered = importers()
+    if name not in registered:
         broken = " (its plug-in cannot be used)" if name in entry_points(group=GROUP).names else ""
-        raise UsageError(f"unknown format {name!r}{broken}; one of {', '.join(known)}")
-    return known[name]
+        raise UsageError(f"unknown format {name!r}{broken}; one of {', '.join(registered)}")
+    return registered[name]
 
 
 def known_formats() -> list[FormatInfo]:
@@ -142,7 +142,7 @@ def recognise(path: Path) -> list[Candidate]:
         The file cannot be read.
     """
     head = _head(path)
-    found = []
+    candidates = []
     for name, (importer, _) in importers().items():
         try:
             confidence = float(importer.sniff(head, path))
@@ -150,8 +150,8 @@ def recognise(path: Path) -> list[Candidate]:
             warnings.warn(f"importer {name} failed to look at {path}: {error!r}", stacklevel=2)
             continue
         if confidence >= CANDIDATE:
-            found.append(Candidate(name, min(confidence, 1.0)))
-    return sorted(found, key=lambda c: -c.confidence)
+            candidates.append(Candidate(name, min(confidence, 1.0)))
+    return sorted(candidates, key=lambda c: -c.confidence)
 
 
 def chief_of(file: Path, format: str) -> Path:
@@ -239,21 +239,21 @@ def share_options(sources: Sequence[ChosenSource], values: Mapping[str, Any]) ->
         key.startswith(f"{sources[0].registered.importer.name}.") for key in values
     ):
         return [make_options(sources[0].registered.importer, values)]
-    given: list[dict[str, Any]] = [{} for _ in sources]
+    shares: list[dict[str, Any]] = [{} for _ in sources]
     for key, value in values.items():
         takers = []
         for k, (registered, _) in enumerate(sources):
             importer = registered.importer
             name = key.removeprefix(f"{importer.name}.")
-            known = {f.name for f in msgspec.structs.fields(importer.Options)}
-            if name in known and not (name == key and k > 0 and key in ("start", "epoch")):
+            fields = {f.name for f in msgspec.structs.fields(importer.Options)}
+            if name in fields and not (name == key and k > 0 and key in ("start", "epoch")):
                 takers.append((k, name))
         if not takers:
             formats = ", ".join(dict.fromkeys(r.importer.name for r, _ in sources))
             raise UsageError(f"option {key!r}: none of the formats {formats} has it; see marcha formats")
         for k, name in takers:
-            given[k][name] = value
-    return [make_options(r.importer, chosen) for (r, _), chosen in zip(sources, given, strict=True)]
+            shares[k][name] = value
+    return [make_options(r.importer, chosen) for (r, _), chosen in zip(sources, shares, strict=True)]
 
 
 def _resolve(
@@ -305,13 +305,13 @@ def _resolve(
 
 def _candidates(path: Path, wanted: Registered | None) -> list[Candidate]:
     """Return the formats that fit; of several only a clear leader."""
-    found = recognise(path)
+    candidates = recognise(path)
     if wanted is not None:
-        return [c for c in found if c.name == wanted.importer.name]
-    if len(found) > 1 and found[0].confidence - found[1].confidence < LEAD:
-        listed = ", ".join(f"{c.name} ({c.confidence:.2f})" for c in found)
+        return [c for c in candidates if c.name == wanted.importer.name]
+    if len(candidates) > 1 and candidates[0].confidence - candidates[1].confidence < LEAD:
+        listed = ", ".join(f"{c.name} ({c.confidence:.2f})" for c in candidates)
         raise MarchaError(f"{path}: could be {listed}; say which with --format")
-    return found
+    return candidates
 
 
 def _tried() -> str:

@@ -57,31 +57,31 @@ def read_line(line: bytes, limits: Sequence[tuple[int, int]]) -> TextLine:
     limits : sequence of (int, int)
         Lowest and highest value of each column.
     """
-    at, wall_ms = 0, -1
+    start, wall_ms = 0, -1
     if wall := _WALL_CLOCK.match(line):
         hours, minutes, seconds = (int(wall[k]) for k in (1, 2, 3))
         thousandths = int((wall[4] or b"")[:3].ljust(3, b"0"))
-        at, wall_ms = wall.end(), ((hours * 60 + minutes) * 60 + seconds) * 1000 + thousandths
-    if at == len(line):
+        start, wall_ms = wall.end(), ((hours * 60 + minutes) * 60 + seconds) * 1000 + thousandths
+    if start == len(line):
         return TextLine(BLANK)
-    if whole := _row(len(limits)).fullmatch(line, at):
+    if whole := _row(len(limits)).fullmatch(line, start):
         values = list(map(int, whole.groups()))
         if all(low <= value <= high for value, (low, high) in zip(values, limits, strict=True)):
             return TextLine(ROW, values, wall_ms)
     values, beyond = [], None
-    while at < len(line):
+    while start < len(line):
         if len(values) == len(limits):
             return TextLine(MANY)
-        number = _NUMBER.match(line, at)
+        number = _NUMBER.match(line, start)
         if number is None:
             return TextLine(
-                CHATTER if not values and _is_words(line[at:]) else NOT_A_NUMBER, column=len(values)
+                CHATTER if not values and _is_words(line[start:]) else NOT_A_NUMBER, column=len(values)
             )
         value, (low, high) = int(number[1] + number[2][:18]), limits[len(values)]
         if beyond is None and not (low <= value <= high and len(number[2]) < 18):
             beyond = len(values)
         values.append(value)
-        at = number.end()
+        start = number.end()
     if beyond is not None:
         return TextLine(OUT_OF_RANGE, column=beyond)
     if len(values) < len(limits):

@@ -144,12 +144,12 @@ class TimestampRepair:
         if not t.null_count() and -most <= int(t.to_numpy().min()) and int(t.to_numpy().max()) <= most:
             return frame
         good = t.is_between(-most, most).fill_null(False)
-        at = int((~good).arg_true()[0])
+        first = int((~good).arg_true()[0])
         self._report.drop(
             "bad_row",
-            f"{self._subject}time {frame['t'][at]} is beyond any clock; row dropped",
+            f"{self._subject}time {frame['t'][first]} is beyond any clock; row dropped",
             count=int((~good).sum()),
-            line=frame["line"][at],
+            line=frame["line"][first],
             subject=f"{self._subject}beyond",
         )
         return frame.filter(good)
@@ -287,10 +287,12 @@ class TimestampRepair:
             return frame, ticks
         data = _readings(frame)
         first = same[0] == 0  # its predecessor is in the block before
-        at = same[1:] if first else same
+        later = same[1:] if first else same
         equal = np.zeros(same.size, dtype=bool)
-        if at.size:
-            pair = [data[c].gather(at).eq_missing(data[c].gather(at - 1)).to_numpy() for c in data.columns]
+        if later.size:
+            pair = [
+                data[c].gather(later).eq_missing(data[c].gather(later - 1)).to_numpy() for c in data.columns
+            ]
             equal[1 if first else 0 :] = np.logical_and.reduce(pair) if pair else True
         if first:
             equal[0] = self._last_row is not None and data.row(0) == self._last_row
@@ -316,13 +318,13 @@ class TimestampRepair:
         odd = np.flatnonzero(np.abs(steps - self._nominal) > max(1.0, JITTER * self._nominal))
         odd = odd[steps[odd] > 0]
         gaps = steps[odd] > GAP * self._nominal
-        for k, at in enumerate((odd[gaps], odd[~gaps])):
-            if not at.size:
+        for k, intervals in enumerate((odd[gaps], odd[~gaps])):
+            if not intervals.size:
                 continue
-            self._counts[k] += at.size
-            self._longest[k] = max(self._longest[k], int(steps[at].max()))
+            self._counts[k] += intervals.size
+            self._longest[k] = max(self._longest[k], int(steps[intervals].max()))
             if self._where[k] is None:
-                self._where[k] = int(frame["line"][int(at[0])])
+                self._where[k] = int(frame["line"][int(intervals[0])])
 
     def _summary(self) -> None:
         nominal = self._nominal or 1

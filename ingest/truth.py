@@ -41,12 +41,12 @@ WALK_FACTS = ("closed", "length_m")
 """Facts of a walk that ``convert --set`` takes as well: as truth, whatever the format."""
 
 
-def walk_facts(given: Mapping[str, Any]) -> dict[str, str]:
+def walk_facts(stated: Mapping[str, Any]) -> dict[str, str]:
     """Return what a user knows of a walk, as text.
 
     Parameters
     ----------
-    given : mapping
+    stated : mapping
         ``closed`` (true or false), ``length_m`` (m), ``steps`` and other facts by name.
 
     Raises
@@ -54,7 +54,7 @@ def walk_facts(given: Mapping[str, Any]) -> dict[str, str]:
     UsageError
         ``closed`` is neither true nor false, or ``length_m`` or ``steps`` is no positive number.
     """
-    facts = {name: as_text(value).strip() for name, value in given.items()}
+    facts = {name: as_text(value).strip() for name, value in stated.items()}
     for name, text in facts.items():
         if name == "closed":
             facts[name] = text.lower()
@@ -141,7 +141,7 @@ def _leg(file: Path) -> Iterator[tuple[ChannelSpec, pl.DataFrame]]:
         angles = table.select(
             pl.col("t_ns").cast(pl.Int64), *(pl.col(c).alias(c[6:]).cast(pl.Float64) for c in joints)
         )
-        found = [
+        channels = [
             (
                 ChannelSpec("/reference/joint", "sensor_msgs/msg/JointState", "", tuple(angles.columns[1:])),
                 angles,
@@ -150,10 +150,10 @@ def _leg(file: Path) -> Iterator[tuple[ChannelSpec, pl.DataFrame]]:
         for name in dict.fromkeys(c.partition(".quat_")[0] for c in table.columns if ".quat_" in c):
             turned = table.select("t_ns", *(pl.col(f"{name}.quat_{a}").alias(f"quat_{a}") for a in "wxyz"))
             spec = ChannelSpec(f"/reference/{name}/orientation", "geometry_msgs/msg/QuaternionStamped", "nav")
-            found.append((spec, turned))
+            channels.append((spec, turned))
     except (OSError, pl.exceptions.PolarsError) as error:
         raise MarchaError(f"{file}: not a readable truth table: {str(error).splitlines()[0]}") from error
-    yield from found
+    yield from channels
 
 
 def as_text(value: object) -> str:

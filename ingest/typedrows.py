@@ -100,9 +100,9 @@ def _split(
         return None
     few = cells < len(names)
     if few.any():
-        at = int(few.arg_true()[0])
-        why = f"{cells[at]} of {len(names)} columns"
-        _bad(group["row"][at], why, int(few.sum()), group["line"][at], report, kind)
+        first = int(few.arg_true()[0])
+        why = f"{cells[first]} of {len(names)} columns"
+        _bad(group["row"][first], why, int(few.sum()), group["line"][first], report, kind)
         group = group.filter(~few)
     if not group.height:
         return None

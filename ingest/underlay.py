@@ -36,7 +36,7 @@ def read_underlay(paths: Sequence[Path]) -> list[SourceAttachment]:
     MarchaError
         A file that cannot be read, lines that are not in degrees, a picture without its corners.
     """
-    found = []
+    files = []
     for path in paths:
         try:
             data = path.read_bytes()
@@ -44,26 +44,26 @@ def read_underlay(paths: Sequence[Path]) -> list[SourceAttachment]:
             raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
         if path.suffix in (".geojson", ".json"):
             try:
-                known = json.loads(data)
+                content = json.loads(data)
             except ValueError as error:
                 raise MarchaError(f"{path}: is no JSON: {error}") from None
             if path.name == "aerial.json":
-                _check_corners(path, known)
-            elif not (isinstance(known, dict) and known.get("type") == "FeatureCollection"):
+                _check_corners(path, content)
+            elif not (isinstance(content, dict) and content.get("type") == "FeatureCollection"):
                 raise MarchaError(
                     f"{path}: is no GeoJSON FeatureCollection; streets are lines of one, in degrees"
                 )
-        found.append(SourceAttachment(path.name, data, MEDIA[path.name]))
-    names = {a.name for a in found}
+        files.append(SourceAttachment(path.name, data, MEDIA[path.name]))
+    names = {a.name for a in files}
     if names & {"aerial.png", "aerial.jpg"} and "aerial.json" not in names:
         raise MarchaError(
             f"{paths[0].parent}: a picture under a map needs aerial.json with {', '.join(CORNERS)}"
         )
-    return found
+    return files
 
 
-def _check_corners(path: Path, known: object) -> None:
-    values = [known.get(k) if isinstance(known, dict) else None for k in CORNERS]
+def _check_corners(path: Path, content: object) -> None:
+    values = [content.get(k) if isinstance(content, dict) else None for k in CORNERS]
     numbers = [v for v in values if isinstance(v, int | float) and math.isfinite(v)]
     if len(numbers) < 4 or not (
         -90 <= numbers[1] < numbers[0] <= 90 and -180 <= numbers[2] < numbers[3] <= 180

@@ -84,7 +84,7 @@ def plain(unit: str) -> str:
     return text if text != "arcs" else "arcsec"
 
 
-def conversion(given: str, wanted: str) -> tuple[float, float]:
+def conversion(unit: str, wanted: str) -> tuple[float, float]:
     """Return (factor, offset) from a unit that a table uses to one of the recording.
 
     Raises
@@ -92,11 +92,11 @@ def conversion(given: str, wanted: str) -> tuple[float, float]:
     UsageError
         The one cannot become the other.
     """
-    known = UNITS.get(wanted, {})
-    text = plain(given)
-    if text in known:
-        return known[text]
-    if text == plain(wanted) or (not known and text in ("", "-", "1")):
+    factors = UNITS.get(wanted, {})
+    text = plain(unit)
+    if text in factors:
+        return factors[text]
+    if text == plain(wanted) or (not factors and text in ("", "-", "1")):
         return 1.0, 0.0
-    listed = ", ".join(known) or "none: leave it out, or use scale"
-    raise UsageError(f"unit {given!r} cannot become {wanted}; known here: {listed}")
+    listed = ", ".join(factors) or "none: leave it out, or use scale"
+    raise UsageError(f"unit {unit!r} cannot become {wanted}; known here: {listed}")

@@ -73,9 +73,9 @@ def check_annotations(table: pl.DataFrame) -> pl.DataFrame:
     table = table.with_columns(
         pl.col(name).cast(kind) for name, kind in FIELDS.items() if table.schema[name] == pl.Null
     )
-    given = table["metadata"].to_list()
-    if not _canonical(given):
-        values = [_metadata(v) for v in given]
+    metadata = table["metadata"].to_list()
+    if not _canonical(metadata):
+        values = [_metadata(v) for v in metadata]
         table = _lifted(table.with_columns(pl.Series("metadata", values, dtype=pl.String)))
     table = table.select(*COLUMNS)
     for name, kind in COLUMNS.items():
@@ -127,15 +127,15 @@ def identified(table: pl.DataFrame) -> pl.DataFrame:
     table : polars.DataFrame
         Columns of :data:`COLUMNS`.
     """
-    given = table["id"]
-    if not given.null_count() and given.n_unique() == table.height:
+    stated_ids = table["id"]
+    if not stated_ids.null_count() and stated_ids.n_unique() == table.height:
         return table
-    taken = set(given.drop_nulls())
+    taken = set(stated_ids.drop_nulls())
     seen: set[str] = set()
     before: dict[bytes, int] = {}
     ids: list[str] = []
     rows = table.select("tier", "start_ns", "end_ns", "label", "metadata").iter_rows()
-    for stated, row in zip(given.to_list(), rows, strict=True):
+    for stated, row in zip(stated_ids.to_list(), rows, strict=True):
         name = stated
         if name is None or name in seen:
             text = "\0".join(map(str, row)).encode()
@@ -260,8 +260,8 @@ def encode_events(rows: pl.DataFrame, channel_id: int) -> tuple[Bytes, NDArray[n
     taken = padded.copy()
     taken[first] += _HEAD.itemsize
     behind = np.cumsum(taken)
-    at = behind - padded
-    records = at[first] - _HEAD.itemsize
+    labels_at = behind - padded
+    records = labels_at[first] - _HEAD.itemsize
     head["opcode"], head["channel"], head["sequence"] = 5, channel_id, np.arange(len(start))
     head["length"] = behind[last] - records - 9
     head["log"] = head["publish"] = start
@@ -271,8 +271,8 @@ def encode_events(rows: pl.DataFrame, channel_id: int) -> tuple[Bytes, NDArray[n
     head["pairs"] = counts
     data = np.zeros(behind[-1], np.uint8)
     data[records[:, None] + np.arange(_HEAD.itemsize)] = head.view(np.uint8).reshape(len(start), -1)
-    data[at[:, None] + np.arange(4)] = (lengths + 1).astype("<u4").view(np.uint8).reshape(-1, 4)
-    data[np.repeat(at + 4 - (ends - lengths), lengths) + np.arange(len(text))] = text
+    data[labels_at[:, None] + np.arange(4)] = (lengths + 1).astype("<u4").view(np.uint8).reshape(-1, 4)
+    data[np.repeat(labels_at + 4 - (ends - lengths), lengths) + np.arange(len(text))] = text
     return data, np.column_stack((start, records))
 
 

@@ -79,16 +79,16 @@ def find(rec: Recording, ids: Collection[str]) -> list[str]:
     UsageError
         No annotation, or several, begin so.
     """
-    known = rec.annotations["id"].to_list()
-    whole = set(known)
-    found = []
+    all_ids = rec.annotations["id"].to_list()
+    whole = set(all_ids)
+    rows = []
     for start in ids:
-        fits = [start] if start in whole else [i for i in known if i.startswith(start)]
+        fits = [start] if start in whole else [i for i in all_ids if i.startswith(start)]
         if len(fits) != 1 or not start:
             what = "no annotation has" if not fits else f"{len(fits)} annotations have"
             raise UsageError(f"{rec.path}: {what} an id that begins with {start!r}; marcha annotate list")
-        found.append(fits[0])
-    return found
+        rows.append(fits[0])
+    return rows
 
 
 def change(
@@ -319,7 +319,7 @@ def check_inside(
 
 
 def check_labels(
-    where: Path, annotations: pl.DataFrame, known: Mapping[str, Vocabulary], *, lines: bool = False
+    where: Path, annotations: pl.DataFrame, by_tier: Mapping[str, Vocabulary], *, lines: bool = False
 ) -> None:
     """Raise ``MarchaError`` where a tier has a closed vocabulary and a label is not in it.
 
@@ -329,12 +329,12 @@ def check_labels(
         File that the annotations come from.
     annotations : polars.DataFrame
         To be checked.
-    known : mapping
+    by_tier : mapping
         Tier to its vocabulary.
     lines : bool
         See :func:`check_inside`.
     """
-    for tier, vocabulary in known.items():
+    for tier, vocabulary in by_tier.items():
         if not vocabulary.closed:
             continue
         odd = (annotations["tier"] == tier) & ~annotations["label"].is_in(list(vocabulary.labels))
@@ -371,9 +371,9 @@ def find_tier(rec: Recording, tier: str) -> str:
     UsageError
         No annotation is of it and it has no vocabulary.
     """
-    known = {*rec.annotations["tier"].unique(), *rec.metadata.get(VOCABULARY, {})}
-    if tier not in known:
-        raise UsageError(f"{rec.path}: no tier {tier!r}; it has {', '.join(sorted(known)) or 'none'}")
+    tiers = {*rec.annotations["tier"].unique(), *rec.metadata.get(VOCABULARY, {})}
+    if tier not in tiers:
+        raise UsageError(f"{rec.path}: no tier {tier!r}; it has {', '.join(sorted(tiers)) or 'none'}")
     return tier
 
 

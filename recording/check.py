@@ -50,15 +50,15 @@ def check(rec: Recording) -> list[Finding]:
         ``all_zero``. ``first_line`` is the row of the channel, from 1. Estimates are only asked if empty:
         their missing values are the estimator's to explain.
     """
-    found = structure(rec)
+    findings = structure(rec)
     if not rec.channels:
-        found.append(Finding("empty_recording", 1, None, "there is no channel in it"))
+        findings.append(Finding("empty_recording", 1, None, "there is no channel in it"))
     for channel in rec.channels.values():
         if not channel.count:
-            found.append(Finding("empty_channel", 1, None, f"{channel.topic}: has no message"))
+            findings.append(Finding("empty_channel", 1, None, f"{channel.topic}: has no message"))
         elif channel.columns and not channel.topic.startswith(ESTIMATE):
-            found += _Watch(channel).run(rec)
-    return [*rec.findings, *found]
+            findings += _Watch(channel).run(rec)
+    return [*rec.findings, *findings]
 
 
 class _Tally:

@@ -158,16 +158,16 @@ def chunk_head(record: bytes, ref: ChunkRef) -> ChunkHead:
     if len(record) < ref.length or ref.length < 9 + 40 or record[0] != Opcode.CHUNK:
         raise ChunkError(f"{where}: no chunk there")
     _, _, size, crc = _CHUNK_HEAD.unpack_from(record, 9)
-    at = 9 + _CHUNK_HEAD.size
-    name_length = int.from_bytes(record[at : at + 4], "little")
-    compression = record[at + 4 : at + 4 + name_length].decode("utf-8", "replace")
-    at += 4 + name_length
-    length = int.from_bytes(record[at : at + 8], "little")
-    if at + 8 + length > len(record):
+    offset = 9 + _CHUNK_HEAD.size
+    name_length = int.from_bytes(record[offset : offset + 4], "little")
+    compression = record[offset + 4 : offset + 4 + name_length].decode("utf-8", "replace")
+    offset += 4 + name_length
+    length = int.from_bytes(record[offset : offset + 8], "little")
+    if offset + 8 + length > len(record):
         raise ChunkError(f"{where}: its length is wrong")
     if size > MAX_CHUNK or size > max(FREE_GROWTH, MOST_GROWTH * length):
         raise ChunkError(f"{where}: claims {size} bytes in {length} packed ones")
-    return ChunkHead(size, crc, compression, at + 8, length)
+    return ChunkHead(size, crc, compression, offset + 8, length)
 
 
 def _decompress(compression: str, body: memoryview, size: int, reuse: bool) -> bytes | memoryview:
@@ -197,12 +197,12 @@ def _fill(stream: Any, size: int) -> memoryview:
     if buffer is None or len(buffer) < size:
         buffer = _local.buffer = bytearray(size)
     view = memoryview(buffer)[:size]
-    at = 0
-    while at < size and (n := stream.readinto(view[at:])):
-        at += n
-    if at == size and stream.read(1):
+    filled = 0
+    while filled < size and (n := stream.readinto(view[filled:])):
+        filled += n
+    if filled == size and stream.read(1):
         raise ValueError("more bytes than stated")
-    return view[:at]
+    return view[:filled]
 
 
 def split(
@@ -233,12 +233,12 @@ def split(
     even = _split_even(data)
     if even is not None:
         return {k: v for k, v in even.items() if wanted is None or k in wanted}
-    raw, size, at = data.data, len(data), 0
+    raw, size, offset = data.data, len(data), 0
     rows: dict[int, tuple[list[int], list[int]]] = {}
     unpack = _RECORD_HEAD.unpack_from
-    while at + 9 <= size:
-        opcode, length = unpack(raw, at)
-        end = at + 9 + length
+    while offset + 9 <= size:
+        opcode, length = unpack(raw, offset)
+        end = offset + 9 + length
         if end > size:
             raise ChunkError(f"a record of {length} bytes runs out of its chunk")
         if opcode == 0:
@@ -246,17 +246,17 @@ def split(
         if opcode == 5:
             if length < 22:
                 raise ChunkError(f"a message record of {length} bytes")
-            channel = raw[at + 9] | raw[at + 10] << 8
+            channel = raw[offset + 9] | raw[offset + 10] << 8
             if wanted is None or channel in wanted:
                 starts, sizes = rows.setdefault(channel, ([], []))
-                starts.append(at)
+                starts.append(offset)
                 sizes.append(length - 22)
         elif on_record is not None and opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             try:
-                on_record(opcode, bytes(raw[at + 9 : end]))
+                on_record(opcode, bytes(raw[offset + 9 : end]))
             except BROKEN as e:
                 raise ChunkError(f"a record of kind {opcode}: {e}") from None
-        at = end
+        offset = end
     return {k: _messages(data, np.array(s, np.int64), np.array(n, np.int64)) for k, (s, n) in rows.items()}
 
 
@@ -269,7 +269,7 @@ def _split_even(data: NDArray[np.uint8]) -> dict[int, Messages] | None:
         return None
     n = len(data) // stride
     # Opcode, length and channel are the first eleven bytes: two overlapping words.
-    low, high = (np.ndarray((n,), "<u8", data, at, (stride,)) for at in (0, 3))  # type: ignore[arg-type]
+    low, high = (np.ndarray((n,), "<u8", data, offset, (stride,)) for offset in (0, 3))  # type: ignore[arg-type]
     if (low != low[0]).any():
         return None
     one_channel = bool((high == high[0]).all())
@@ -308,14 +308,16 @@ def read_index(file: FileReader, ref: ChunkRef) -> dict[int, NDArray[np.int64]]:
     """
     data = file.read(ref.start + ref.length, ref.index_length)
     out: dict[int, NDArray[np.int64]] = {}
-    at = 0
-    while at < len(data):
-        if at + _INDEX_HEAD.size > len(data):
+    offset = 0
+    while offset < len(data):
+        if offset + _INDEX_HEAD.size > len(data):
             raise ChunkError("a message index is cut short")
-        opcode, length, channel, size = _INDEX_HEAD.unpack_from(data, at)
+        opcode, length, channel, size = _INDEX_HEAD.unpack_from(data, offset)
         if opcode == Opcode.MESSAGE_INDEX:
-            if size % 16 or at + _INDEX_HEAD.size + size > len(data):
+            if size % 16 or offset + _INDEX_HEAD.size + size > len(data):
                 raise ChunkError("a message index has a wrong length")
-            out[channel] = np.frombuffer(data, "<u8", size // 8, at + _INDEX_HEAD.size)[::2].astype(np.int64)
-        at += 9 + length
+            out[channel] = np.frombuffer(data, "<u8", size // 8, offset + _INDEX_HEAD.size)[::2].astype(
+                np.int64
+            )
+        offset += 9 + length
     return out

@@ -85,14 +85,16 @@ def find_contents(file: FileReader) -> Contents:
             return contents
         reason = UNINDEXED
         stated = contents.statistics if contents is not None else None
-    found = _scan(file, reason)
-    count = found.statistics.message_count if found.statistics is not None else 0
-    if stated is not None and stated.message_count > count and not found.findings:
+    scanned = _scan(file, reason)
+    count = scanned.statistics.message_count if scanned.statistics is not None else 0
+    if stated is not None and stated.message_count > count and not scanned.findings:
         lost = stated.message_count - count
         _add(
-            found.findings, "lost_messages", f"the file tells of {stated.message_count}, {lost} are not there"
+            scanned.findings,
+            "lost_messages",
+            f"the file tells of {stated.message_count}, {lost} are not there",
         )
-    return found
+    return scanned
 
 
 def _summary(file: FileReader) -> Contents | None:
@@ -163,10 +165,10 @@ def _scan(file: FileReader, reason: str) -> Contents:
     """Walk the records from the start, keep whole and sound chunks, stop where the bytes make no sense."""
     contents = Contents(indexed=False)
     counts: dict[int, int] = {}
-    at, ended, run = 8, False, None
-    while at + 9 <= file.size:
-        opcode, length = _RECORD_HEAD.unpack(file.read(at, 9))
-        body, end = at + 9, at + 9 + length
+    offset, ended, run = 8, False, None
+    while offset + 9 <= file.size:
+        opcode, length = _RECORD_HEAD.unpack(file.read(offset, 9))
+        body, end = offset + 9, offset + 9 + length
         if end > file.size:
             break
         if opcode != Opcode.MESSAGE:
@@ -176,28 +178,28 @@ def _scan(file: FileReader, reason: str) -> Contents:
                 ended = True
                 break
             if opcode == Opcode.CHUNK:
-                _scan_chunk(file, ChunkRef(at, end - at, 0, 0), contents, counts)
+                _scan_chunk(file, ChunkRef(offset, end - offset, 0, 0), contents, counts)
             elif opcode == Opcode.MESSAGE:
-                run = _scan_message(file, at, end, run, contents, counts)
+                run = _scan_message(file, offset, end, run, contents, counts)
             elif opcode == Opcode.MESSAGE_INDEX and contents.chunks:
                 chunk = contents.chunks[-1]
-                if not chunk.loose and chunk.start + chunk.length + chunk.index_length == at:
-                    chunk.index_length += end - at
+                if not chunk.loose and chunk.start + chunk.length + chunk.index_length == offset:
+                    chunk.index_length += end - offset
             elif opcode in (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA):
-                _scan_record(opcode, at, file.read(body, length), contents)
+                _scan_record(opcode, offset, file.read(body, length), contents)
             elif opcode == Opcode.ATTACHMENT:
-                _scan_attachment(file, at, length, contents)
+                _scan_attachment(file, offset, length, contents)
             elif opcode == 0:
                 break
         except BROKEN as e:
-            _add(contents.findings, "bad_record", f"byte {at}: {e or type(e).__name__}; skipped")
+            _add(contents.findings, "bad_record", f"byte {offset}: {e or type(e).__name__}; skipped")
             run = None
-        at = end
+        offset = end
     if not ended:
         _add(
             contents.findings,
             "truncated",
-            f"{reason}: cut short at byte {at} of {file.size}; read up to the last whole chunk",
+            f"{reason}: cut short at byte {offset} of {file.size}; read up to the last whole chunk",
         )
     elif reason != UNINDEXED:
         _add(contents.findings, "bad_summary", f"{reason}; the file was read from its start")
@@ -248,23 +250,23 @@ def _scan_chunk(file: FileReader, ref: ChunkRef, contents: Contents, counts: dic
 
 
 def _scan_message(
-    file: FileReader, at: int, end: int, run: ChunkRef | None, contents: Contents, counts: dict[int, int]
+    file: FileReader, offset: int, end: int, run: ChunkRef | None, contents: Contents, counts: dict[int, int]
 ) -> ChunkRef:
-    head = np.frombuffer(file.read(at, PREFIX.itemsize), PREFIX)[0]
+    head = np.frombuffer(file.read(offset, PREFIX.itemsize), PREFIX)[0]
     channel, log = int(head["channel"]), int(head["log"])
     if max(log, int(head["publish"])) > LAST_NS:
         raise ValueError("a message at a time beyond the year 2262")
-    if run is None or run.length + end - at > _RUN:
-        run = ChunkRef(at, 0, log, log, loose=True)
+    if run is None or run.length + end - offset > _RUN:
+        run = ChunkRef(offset, 0, log, log, loose=True)
         contents.chunks.append(run)
-    run.length += end - at
+    run.length += end - offset
     run.first_ns, run.last_ns = min(run.first_ns, log), max(run.last_ns, log)
     run.indexes[channel] = 0
     counts[channel] = counts.get(channel, 0) + 1
     return run
 
 
-def _scan_record(opcode: int, at: int, body: bytes, contents: Contents) -> None:
+def _scan_record(opcode: int, offset: int, body: bytes, contents: Contents) -> None:
     stream = ReadDataStream(BytesIO(body))
     if opcode == Opcode.HEADER:
         header = Header.read(stream)
@@ -276,12 +278,12 @@ def _scan_record(opcode: int, at: int, body: bytes, contents: Contents) -> None:
         channel = Channel.read(stream)
         contents.channels[channel.id] = channel
     else:
-        contents.metadata.append(MetadataIndex(at, 9 + len(body), stream.read_prefixed_string()))
+        contents.metadata.append(MetadataIndex(offset, 9 + len(body), stream.read_prefixed_string()))
 
 
-def _scan_attachment(file: FileReader, at: int, length: int, contents: Contents) -> None:
-    stream = ReadDataStream(BytesIO(file.read(at + 9, min(length, 1 << 16))))
+def _scan_attachment(file: FileReader, offset: int, length: int, contents: Contents) -> None:
+    stream = ReadDataStream(BytesIO(file.read(offset + 9, min(length, 1 << 16))))
     log, created = stream.read8(), stream.read8()
     name, media = stream.read_prefixed_string(), stream.read_prefixed_string()
     size = stream.read8()
-    contents.attachments.append(AttachmentIndex(at, 9 + length, log, created, size, name, media))
+    contents.attachments.append(AttachmentIndex(offset, 9 + length, log, created, size, name, media))

@@ -97,11 +97,11 @@ def _verbatim(rec: Recording, ref: ChunkRef) -> Packed | None:
     if set(times) != set(ref.indexes):
         return None
     channels: dict[int, tuple[int, int]] = {}
-    at = 0
-    while at < len(indexes):
-        channel = int.from_bytes(indexes[at + 9 : at + 11], "little")
-        channels[channel] = (at, len(times[channel]))
-        at += 9 + int.from_bytes(indexes[at + 1 : at + 9], "little")
+    offset = 0
+    while offset < len(indexes):
+        channel = int.from_bytes(indexes[offset + 9 : offset + 11], "little")
+        channels[channel] = (offset, len(times[channel]))
+        offset += 9 + int.from_bytes(indexes[offset + 1 : offset + 9], "little")
     return Packed(
         (record,),
         (indexes,),

@@ -120,8 +120,8 @@ class BoundLayout:
             if schema.names:
                 count = layout.sequences[schema.names]
                 constants += [f"{schema.names}[{i}]" for i in range(count)]
-                given = (layout.text(record, f"{schema.names}[{i}]") or "" for i in range(count))
-                names = _distinct(["t_ns", "t_log_ns", *given])[2:]
+                own = (layout.text(record, f"{schema.names}[{i}]") or "" for i in range(count))
+                names = _distinct(["t_ns", "t_log_ns", *own])[2:]
             self.rows.append(_bind(schema, layout, record, names, decoder.columns))
             self.stamps.append(schema.stamp)
         fields = layout.dtype.fields or {}

@@ -70,13 +70,15 @@ class Chunk:
         self._sequence, self._log, self._publish = (
             self._field(*prefix[name][:2]) for name in ("sequence", "log", "publish")
         )
-        self._fields = [(column, self._field(of, at)) for column, of, at in template.fields]
+        self._fields = [(column, self._field(of, offset)) for column, of, offset in template.fields]
         four = np.dtype("<i4")
-        self._times = [(c, self._field(four, at), self._field(four, at + 4)) for c, at in template.times]
+        self._times = [
+            (c, self._field(four, offset), self._field(four, offset + 4)) for c, offset in template.times
+        ]
 
-    def _field(self, of: np.dtype[Any], at: int) -> NDArray[Any]:
+    def _field(self, of: np.dtype[Any], offset: int) -> NDArray[Any]:
         """Return a field of all records as one array."""
-        return np.ndarray((self.most,), of, self._data, at, (self.size,))  # type: ignore[arg-type]
+        return np.ndarray((self.most,), of, self._data, offset, (self.size,))  # type: ignore[arg-type]
 
     @property
     def data(self) -> Bytes:
@@ -140,29 +142,29 @@ def resolve_columns(
     MarchaError
         A column is unknown, or one that must be there is not.
     """
-    given = set(columns)
+    present = set(columns)
     names = _names_of(schema, columns) if schema.names else ()
     if schema.names and not names:
         raise MarchaError(f"{topic}: {schema.name} needs one column a name, got none")
     groups: list[ColumnGroup] = []
-    known: set[str] = set()
+    taken: set[str] = set()
     for group in schema.groups:
         wanted = (
             [n + c.name for c in group.columns for n in names]
             if schema.names
             else [c.name for c in group.columns]
         )
-        here = given.intersection(wanted)
-        known.update(wanted)
+        here = present.intersection(wanted)
+        taken.update(wanted)
         if not here and group.optional:
             continue
-        missing = [w for w in wanted if w not in given]
+        missing = [w for w in wanted if w not in present]
         if missing:
             raise MarchaError(
                 f"{topic}: {schema.name} lacks the column {', '.join(missing)}; give it, or NaN in it"
             )
         groups.append(group)
-    unknown = [c for c in columns if c not in known]
+    unknown = [c for c in columns if c not in taken]
     if unknown:
         raise MarchaError(
             f"{topic}: {schema.name} has no column {', '.join(map(repr, unknown))}; it has "
@@ -255,8 +257,8 @@ class Encoder:
         view["@length"] = record.size - 9
         view["@channel"] = self.channel_id
         for path, value in self._constants.items():
-            field, at = _field(dtype, path)
-            record[at : at + field.itemsize].view(field.base)[:] = value
+            field, offset = _field(dtype, path)
+            record[offset : offset + field.itemsize].view(field.base)[:] = value
         template = self._cache[texts] = RecordTemplate(
             dtype, record, *_fields(dtype, self._root + self.schema.stamp, self.bindings)
         )
@@ -322,15 +324,17 @@ class Encoder:
         dtype = self._template(tuple(b"" for _ in self._text_bindings)).dtype
         return {b.column: self._array(table[b.column], b, dtype) for b in self.bindings}
 
-    def _array(self, given: pl.Series | NDArray[Any], binding: Binding, dtype: np.dtype[Any]) -> NDArray[Any]:
+    def _array(
+        self, source: pl.Series | NDArray[Any], binding: Binding, dtype: np.dtype[Any]
+    ) -> NDArray[Any]:
         where = f"{self.topic}: column {binding.column!r}"
         kind = binding.kind
-        if isinstance(given, np.ndarray):  # a series would be a copy
-            if given.dtype == np.float64 and kind == "number" and _field(dtype, binding.path)[0].kind == "f":
-                return given
-            if given.dtype == np.bool_ and kind == "flag":
-                return given
-        series = given if isinstance(given, pl.Series) else pl.Series(given)
+        if isinstance(source, np.ndarray):  # a series would be a copy
+            if source.dtype == np.float64 and kind == "number" and _field(dtype, binding.path)[0].kind == "f":
+                return source
+            if source.dtype == np.bool_ and kind == "flag":
+                return source
+        series = source if isinstance(source, pl.Series) else pl.Series(source)
         of = series.dtype
         if kind == "flag":
             _refuse(where, of, of == pl.Boolean or of.is_integer(), "Boolean")
@@ -438,8 +442,8 @@ def _field(dtype: np.dtype[Any], path: str) -> tuple[np.dtype[Any], int]:
     if path in fields:
         return fields[path][:2]
     base, index = split_index(path)
-    of, at = fields[base][:2]
-    return of.base, at + (index or 0) * of.base.itemsize
+    of, offset = fields[base][:2]
+    return of.base, offset + (index or 0) * of.base.itemsize
 
 
 def _fields(

@@ -49,8 +49,8 @@ def read_events(path: Path, origin_ns: int, *, tier: str | None = None, offset_n
     if {"start_ns", "end_ns"} <= names:
         start, end = (_numbers(path, cells, name, pl.Int64) + offset_ns for name in ("start_ns", "end_ns"))
     elif {"onset", "duration"} <= names:
-        known = cells.with_columns(pl.col("duration").fill_null("0"))
-        onset, duration = (_numbers(path, known, name, pl.Float64) for name in ("onset", "duration"))
+        complete = cells.with_columns(pl.col("duration").fill_null("0"))
+        onset, duration = (_numbers(path, complete, name, pl.Float64) for name in ("onset", "duration"))
         start = origin_ns + _nanoseconds(path, onset)
         end = start + _nanoseconds(path, duration)
     else:
@@ -89,13 +89,13 @@ def _metadata(path: Path, cells: pl.DataFrame, label: str) -> pl.Series:
     """Return the metadata of each row: the column of that name, and columns that have no other place."""
     places = {"onset", "duration", "tier", "start_ns", "end_ns", "metadata", label, *FIELDS}
     others = [name for name in cells.columns if name not in places]
-    given = (
+    texts = (
         cells["metadata"].fill_null("{}").to_list() if "metadata" in cells.columns else ["{}"] * cells.height
     )
     if not others:
-        return pl.Series(given, dtype=pl.String)
+        return pl.Series(texts, dtype=pl.String)
     out = []
-    for row, (text, values) in enumerate(zip(given, cells.select(others).iter_rows(), strict=True)):
+    for row, (text, values) in enumerate(zip(texts, cells.select(others).iter_rows(), strict=True)):
         try:
             facts = msgspec.json.decode(text, type=dict)
         except msgspec.MsgspecError:

@@ -51,13 +51,13 @@ class Vocabulary(msgspec.Struct, frozen=True, kw_only=True):
 
 def vocabularies(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, Vocabulary]:
     """Return the vocabularies of a recording by tier; one that cannot be read is left out."""
-    found = {}
+    result = {}
     for tier, text in metadata.get(VOCABULARY, {}).items():
         try:
-            found[tier] = msgspec.json.decode(text, type=Vocabulary)
+            result[tier] = msgspec.json.decode(text, type=Vocabulary)
         except msgspec.MsgspecError:
             continue
-    return found
+    return result
 
 
 def to_events(annotations: pl.DataFrame, origin_ns: int) -> pl.DataFrame:
@@ -125,11 +125,11 @@ def sidecar(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
         about[name] = {"Description": text}
         if name in units:
             about[name]["Units"] = units[name]
-    known = vocabularies(metadata)
-    levels = {label: text or label for v in known.values() for label, text in v.labels.items()}
+    by_tier = vocabularies(metadata)
+    levels = {label: text or label for v in by_tier.values() for label, text in v.labels.items()}
     if levels:
         about["trial_type"]["Levels"] = levels
-    tags = {label: text for v in known.values() for label, text in v.hed.items()}
+    tags = {label: text for v in by_tier.values() for label, text in v.hed.items()}
     if tags:
         about["trial_type"]["HED"] = tags
     return about

@@ -78,11 +78,11 @@ def parse_toml(data: bytes, name: str, type: Any = Any) -> Any:
     try:
         return msgspec.toml.decode(data, type=type)
     except msgspec.ValidationError as error:
-        said, _, where = str(error).partition(" - at `$")
+        complaint, _, where = str(error).partition(" - at `$")
         key = where.rstrip("`").lstrip(".") or "top level"
-        if (choices := _choices(type, key)) and said.startswith("Invalid enum"):
-            said += f"; one of {', '.join(choices)}"
-        raise MarchaError(f"{name}: {key}: {said}") from error
+        if (choices := _choices(type, key)) and complaint.startswith("Invalid enum"):
+            complaint += f"; one of {', '.join(choices)}"
+        raise MarchaError(f"{name}: {key}: {complaint}") from error
     except (ValueError, RecursionError) as error:  # also bytes that are no UTF-8, and numbers without end
         raise MarchaError(f"{name}: not TOML: {error}") from error
 

@@ -188,7 +188,7 @@ class McapFile:
                 compressed_size=packed.compressed_size,
                 message_end_time=packed.last_ns,
                 message_index_length=self._at - index_at,
-                message_index_offsets={c: index_at + at for c, (at, _) in packed.channels.items()},
+                message_index_offsets={c: index_at + offset for c, (offset, _) in packed.channels.items()},
                 message_start_time=packed.first_ns,
                 uncompressed_size=packed.uncompressed_size,
             )

@@ -38,19 +38,19 @@ def options_of(
     about = msgspec.inspect.type_info(kind)
     assert isinstance(about, msgspec.inspect.StructType)
     kinds = {field.name: _plain(field.type) for field in about.fields}
-    given: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for name, value in values.items():
         if name not in kinds:
-            known = ", ".join(sorted(kinds)) or "none"
-            raise UsageError(f"{where} has no option {prefix + name!r}; it has {known}{more}")
+            names = ", ".join(sorted(kinds)) or "none"
+            raise UsageError(f"{where} has no option {prefix + name!r}; it has {names}{more}")
         several = isinstance(kinds[name], msgspec.inspect.VarTupleType)
-        given[name] = (
+        result[name] = (
             [part.strip() for part in value.split(",") if part.strip()]
             if several and isinstance(value, str)
             else value
         )
     try:
-        return msgspec.convert(given, kind, strict=False)
+        return msgspec.convert(result, kind, strict=False)
     except msgspec.ValidationError as error:
         reason, _, path = str(error).partition(" - at `$.")
         name = path.rstrip("`")

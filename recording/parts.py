@@ -223,11 +223,11 @@ def anonymize(
                 texts = marks[column].drop_nulls().unique(maintain_order=True).to_list()
                 left += [f"{column} {text!r}" for text in texts if text]
         files = _merged_names(rec)
-        for known, values in rec.metadata.items():
-            first, slash, rest = known.partition("/")
-            name = f"{files[first]}/{rest}" if slash and first in files else known
+        for record, values in rec.metadata.items():
+            first, slash, rest = record.partition("/")
+            name = f"{files[first]}/{rest}" if slash and first in files else record
             kept = {k: v for k, v in values.items() if not (_is_private(k) or _ORIGIN.search(name))}
-            removed += [f"metadata {known}: {k}" for k in values if k not in kept]
+            removed += [f"metadata {record}: {k}" for k in values if k not in kept]
             left += [f"metadata {name}: {k} = {v}" for k, v in kept.items()]
             if kept:
                 file.add_metadata(name, kept)

@@ -54,7 +54,7 @@ def plugins(
 def _plugins(
     scan: Scan, path: tuple[str, ...], group: str, kind: str, use: Callable[[Any], Any]
 ) -> dict[str, Plugin]:
-    found: dict[str, Plugin] = {}
+    result: dict[str, Plugin] = {}
     for point in sorted(scan(group=group), key=lambda p: p.name):
         source = f"{point.dist.name} {point.dist.version}" if point.dist else "unknown"
         label = f"{kind} plug-in {point.name} ({point.value}, {source})"
@@ -64,10 +64,10 @@ def _plugins(
             reason = " ".join(str(error).split())
             warnings.warn(f"{label} cannot be used: {type(error).__name__}: {reason}", stacklevel=3)
             continue
-        if point.name in found:
+        if point.name in result:
             warnings.warn(
-                f"{label} is left out: {found[point.name].source} has the name already", stacklevel=3
+                f"{label} is left out: {result[point.name].source} has the name already", stacklevel=3
             )
             continue
-        found[point.name] = Plugin(part, source)
-    return found
+        result[point.name] = Plugin(part, source)
+    return result

@@ -315,27 +315,27 @@ class Recording:
     ) -> Decoder | EventDecoder:
         if channel.message_encoding != "cdr":
             raise MarchaError(f"message encoding {channel.message_encoding!r}, only cdr is read")
-        known: Schema | None = SCHEMAS.get(source.schema)
-        if record is None or (record.encoding != "ros2msg" and known is None and source.schema != EVENT):
+        ours_of: Schema | None = SCHEMAS.get(source.schema)
+        if record is None or (record.encoding != "ros2msg" and ours_of is None and source.schema != EVENT):
             raise MarchaError(
                 f"schema encoding {record.encoding if record else 'none'!r}, only ros2msg is read"
             )
         if record.encoding == "ros2msg":
             library = parse_full(record.name, record.data.decode())
-            ours = load(source.schema) if known else {}
-            if known and any(
+            ours = load(source.schema) if ours_of else {}
+            if ours_of and any(
                 library.get(k) is None or library[k].fields != d.fields for k, d in ours.items()
             ):
-                known = None  # somebody's own message of the same name: take it as it is
+                ours_of = None  # somebody's own message of the same name: take it as it is
         else:
             library = load(source.schema)
         if source.schema == EVENT and library == load(EVENT):
             source.declared = tuple(COLUMNS)[1:]
             return EventDecoder(library)
         text = source.metadata.get("columns")
-        if known is not None and text is not None and "frame_id" in source.metadata:
-            source.declared = declared_columns(known, text)
-        return Decoder(known, library, source.declared)
+        if ours_of is not None and text is not None and "frame_id" in source.metadata:
+            source.declared = declared_columns(ours_of, text)
+        return Decoder(ours_of, library, source.declared)
 
     def _source(self, topic: str) -> TopicSource:
         source = self.sources.get(topic)

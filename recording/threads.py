@@ -18,8 +18,8 @@ LIMIT = "MARCHA_THREADS"
 
 def threads() -> int:
     """Return how many threads may work at a time: one a core, at most 4, at most :data:`LIMIT`."""
-    given = os.environ.get(LIMIT, "")
-    most = int(given) if given.isdigit() and int(given) > 0 else 4
+    stated = os.environ.get(LIMIT, "")
+    most = int(stated) if stated.isdigit() and int(stated) > 0 else 4
     return min(4, most, os.cpu_count() or 1)
 
 

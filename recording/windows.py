@@ -108,16 +108,16 @@ def cut(held: dict[str, list[Columns]], horizon: int | None, max_rows: int) -> I
     if not len(times):
         return
     cuts = [int(times[0])]
-    at = 0
-    while at < len(times) and (horizon is None or at + max_rows <= len(times)):
-        at = min(at + max_rows, len(times))
-        if at < len(times):  # a window ends before a log time, never amid rows that share it
-            left = int(np.searchsorted(times, times[at], side="left"))
-            at = left if times[at] > cuts[-1] else int(np.searchsorted(times, times[at], side="right"))
-        cuts.append(int(times[at]) if at < len(times) else int(times[-1]) + 1)
+    row = 0
+    while row < len(times) and (horizon is None or row + max_rows <= len(times)):
+        row = min(row + max_rows, len(times))
+        if row < len(times):  # a window ends before a log time, never amid rows that share it
+            left = int(np.searchsorted(times, times[row], side="left"))
+            row = left if times[row] > cuts[-1] else int(np.searchsorted(times, times[row], side="right"))
+        cuts.append(int(times[row]) if row < len(times) else int(times[-1]) + 1)
     for topic, table in tables.items():
-        at = int(np.searchsorted(logs[topic], cuts[-1]))
-        held[topic] = [_columns(table.slice(at))] if at < table.height else []
+        row = int(np.searchsorted(logs[topic], cuts[-1]))
+        held[topic] = [_columns(table.slice(row))] if row < table.height else []
     for start, end in pairwise(cuts):
         window: dict[str, pl.DataFrame] = {}
         for topic, table in tables.items():

@@ -191,8 +191,8 @@ class Writer:
             raise UsageError(f"{where}: {schema} into a channel of {out.schema}")
         if frame_id and out.frame_id != frame_id:
             raise UsageError(f"{where}: frame_id {frame_id!r}, the channel has {out.frame_id!r}")
-        given = {s.name: s for s in table.get_columns()} if isinstance(table, pl.DataFrame) else dict(table)
-        columns = tuple(c for c in given if c not in ("t_ns", "t_log_ns"))
+        series = {s.name: s for s in table.get_columns()} if isinstance(table, pl.DataFrame) else dict(table)
+        columns = tuple(c for c in series if c not in ("t_ns", "t_log_ns"))
         if out.encoder is None:
             self._declare(out, columns)
         assert out.encoder is not None
@@ -201,10 +201,10 @@ class Writer:
             raise MarchaError(
                 f"{where}: every table of a channel has the same columns; missing or unknown: {odd}"
             )
-        t_ns = self._times(given, "t_ns", where)
-        log = self._times(given, "t_log_ns", where) if "t_log_ns" in given else t_ns
-        if any(len(values) != len(t_ns) for values in given.values()):
-            lengths = {name: len(values) for name, values in given.items()}
+        t_ns = self._times(series, "t_ns", where)
+        log = self._times(series, "t_log_ns", where) if "t_log_ns" in series else t_ns
+        if any(len(values) != len(t_ns) for values in series.values()):
+            lengths = {name: len(values) for name, values in series.items()}
             raise MarchaError(f"{where}: columns of different lengths: {lengths}")
         if len(log) == 0:
             return
@@ -216,7 +216,7 @@ class Writer:
                 "sort the rows by log time"
             )
         try:
-            arrays = out.encoder.arrays(given)
+            arrays = out.encoder.arrays(series)
         except MarchaError as e:
             raise MarchaError(f"{self.path}: {e}") from None
         out.last_log = int(log[-1])
@@ -402,9 +402,9 @@ class Writer:
         file.add_channel(Channel(out.id, out.topic, "cdr", metadata, schema))
 
     def _times(
-        self, given: Mapping[str, pl.Series | NDArray[Any]], name: str, where: str
+        self, series: Mapping[str, pl.Series | NDArray[Any]], name: str, where: str
     ) -> NDArray[np.int64]:
-        values = given.get(name)
+        values = series.get(name)
         if isinstance(values, pl.Series) and values.dtype == pl.Int64 and not values.null_count():
             values = values.to_numpy()
         if not isinstance(values, np.ndarray) or values.dtype != np.int64:
@@ -420,14 +420,14 @@ class Writer:
             out.sequence += len(records)
             self._gather(out, zip(log.tolist(), records, strict=True))
             return
-        at = 0
-        while at < len(log):
+        row = 0
+        while row < len(log):
             chunk = out.chunk = out.chunk or encoder.chunk(CHUNK_SIZE)
-            n = min(len(log) - at, chunk.most - chunk.rows)
-            rows = slice(at, at + n)
+            n = min(len(log) - row, chunk.most - chunk.rows)
+            rows = slice(row, row + n)
             columns = {name: values[rows] for name, values in arrays.items()}
             chunk.encode_into(columns, t_ns[rows], log[rows], out.sequence)
-            at += n
+            row += n
             out.sequence += n
             if chunk.rows == chunk.most:
                 self._flush(out)
@@ -478,13 +478,13 @@ class Writer:
     def _put_events(self, rows: pl.DataFrame, id_: int) -> None:
         data, index = encode_events(rows, id_)
         ends = np.append(index[1:, 1], data.size)
-        at = 0
-        while at < len(index):
-            begin = index[at, 1]
-            n = max(1, int(np.searchsorted(ends, begin + CHUNK_SIZE, side="right")) - at)
-            part = index[at : at + n] - (0, begin)
-            self._file.submit(pack, data[begin : ends[at + n - 1]], id_, part, self._level)
-            at += n
+        row = 0
+        while row < len(index):
+            begin = index[row, 1]
+            n = max(1, int(np.searchsorted(ends, begin + CHUNK_SIZE, side="right")) - row)
+            part = index[row : row + n] - (0, begin)
+            self._file.submit(pack, data[begin : ends[row + n - 1]], id_, part, self._level)
+            row += n
 
 
 def pack_records(records: Sequence[tuple[int, bytes]], channel_id: int, level: int | None) -> Packed:

@@ -178,8 +178,8 @@ def replay(
             run.annotations = run.annotations.clear()
         give_back_memory()
         with open_recording(target) as written:
-            found = evaluate(written, runs=[r.run for r in result.runs], intervals=False, survey=survey)
-        evaluated = {r.run: r for r in found.runs}
+            evaluation = evaluate(written, runs=[r.run for r in result.runs], intervals=False, survey=survey)
+        evaluated = {r.run: r for r in evaluation.runs}
         for run in result.runs:
             run.metrics, run.alignment = evaluated[run.run].metrics, evaluated[run.run].alignment
     return result

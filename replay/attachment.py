@@ -256,13 +256,13 @@ def _nothing_fits(need: Input, name: str, source: Source, chosen: NamedChannels)
 
 def _sides(alike: Sequence[Input], source: Source, chosen: NamedChannels) -> list[dict[str, PlannedChannel]]:
     """Return, for every side on which all of the inputs have a channel of their name, these channels."""
-    found = []
+    sides = []
     for side in SIDES:
         pool = _candidates(Input("", alike[0].schema, alike[0].columns), source, chosen, only_named=True)
         own = {i.name: [c for c in pool if f"{side}_{i.name}" in c.topic.split("/")] for i in alike}
         if all(len(channels) == 1 for channels in own.values()):
-            found.append({name: channels[0] for name, channels in own.items()})
-    return found
+            sides.append({name: channels[0] for name, channels in own.items()})
+    return sides
 
 
 def _side_of(topics: Iterable[str]) -> str:
@@ -324,7 +324,7 @@ def _complete(
     notes: Sequence[Finding],
 ) -> ChannelAttachment:
     """Attach the further inputs of one run."""
-    found = list(notes)
+    findings = list(notes)
     channels: dict[str, tuple[PlannedChannel, ...]] = {}
     raw = [c for attached in have.values() for c in attached if not c.run]
     beside = device_of(raw[0].topic) if raw else device
@@ -353,7 +353,7 @@ def _complete(
             channels[need.name] = ()
             topics = ", ".join(c.topic for c in candidates)
             if need.optional:
-                found.append(
+                findings.append(
                     Finding(
                         "ambiguous_input",
                         len(candidates),
@@ -371,4 +371,4 @@ def _complete(
             raise UsageError(
                 _nothing_fits(need, name, source, chosen) + f"; name it with --input {need.name}=TOPIC"
             )
-    return ChannelAttachment({i.name: channels[i.name] for i in inputs}, tuple(found))
+    return ChannelAttachment({i.name: channels[i.name] for i in inputs}, tuple(findings))

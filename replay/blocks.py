@@ -71,5 +71,5 @@ def joined_by_name(parts: list[dict[str, Block]]) -> dict[str, Block]:
     """Return the blocks of several parts, one by name."""
     if len(parts) == 1:
         return parts[0]
-    names = dict.fromkeys(n for given in parts for n in given)
-    return {n: joined([given[n] for given in parts if n in given]) for n in names}
+    names = dict.fromkeys(n for part in parts for n in part)
+    return {n: joined([part[n] for part in parts if n in part]) for n in names}

@@ -46,11 +46,11 @@ def calibrations_of(metadata: Mapping[str, Mapping[str, str]]) -> list[Calibrati
 
 def usable(calibrations: Iterable[Calibration]) -> dict[str, Calibration]:
     """Return those that may be applied, by kind and subject; the first of a kind and subject counts."""
-    found: dict[str, Calibration] = {}
+    result: dict[str, Calibration] = {}
     for one in calibrations:
         if one.usable:
-            found.setdefault(f"{one.kind}:{one.subject}" if one.subject else one.kind, one)
-    return found
+            result.setdefault(f"{one.kind}:{one.subject}" if one.subject else one.kind, one)
+    return result
 
 
 def metadata_of(calibrations: Iterable[Calibration]) -> dict[str, dict[str, str]]:
@@ -143,7 +143,7 @@ def calibrate(
     chosen.check(sources[0], (i.name for i in calibrator.inputs))
     spans = [(s, span, label) for s in sources for span, label in _spans(s, interval, start_ns, end_ns)]
     digests = {id(s): hash_file(Path(s.recording.path)) for s in sources}
-    found: list[Calibration] = []
+    calibrations: list[Calibration] = []
     for attachment in attach(calibrator.inputs, name, sources[0], chosen, {}):
         topics = {role: tuple(c.topic for c in channels) for role, channels in attachment.channels.items()}
         stretches = [
@@ -164,8 +164,8 @@ def calibrate(
             }
             for source, span, _ in spans
         ]
-        found.append(result)
-    return found
+        calibrations.append(result)
+    return calibrations
 
 
 Span = tuple[int | None, int | None]
@@ -196,7 +196,7 @@ def _stretch(
     tables: dict[str, tuple[pl.DataFrame, ...]] = {}
     channels: dict[str, tuple[ChannelInfo, ...]] = {}
     for need in inputs:
-        found, infos = [], []
+        parts, infos = [], []
         for topic in topics[need.name]:
             if topic not in source.channels:
                 raise UsageError(f"{source.name}: no channel {topic}, which the first recording has")
@@ -207,13 +207,13 @@ def _stretch(
                 table = table.filter(pl.all_horizontal(pl.col(columns).is_finite())).unique(
                     "t_ns", keep="first", maintain_order=True
                 )
-            found.append(table)
+            parts.append(table)
             infos.append(
                 ChannelInfo(
                     topic, channel.schema, channel.frame_id, columns, source.rate_hz(topic), channel.metadata
                 )
             )
-        tables[need.name], channels[need.name] = tuple(found), tuple(infos)
+        tables[need.name], channels[need.name] = tuple(parts), tuple(infos)
     return Stretch(channels, tables, source.metadata, source.attachments, label)
 
 

@@ -122,8 +122,8 @@ class Engine:
         self._feeds = list(feeds.values())
         served = {c.topic for r in runs for c in r.inputs}
         self._read_by_runs = {c.topic for r in runs for c in r.outputs.values() if c.topic in served}
-        given = {(c.kind, c.subject): c for r in runs for c in r.calibrations}
-        self._corrections, self._corrected = corrections(list(given.values()), source.channels)
+        chosen = {(c.kind, c.subject): c for r in runs for c in r.calibrations}
+        self._corrections, self._corrected = corrections(list(chosen.values()), source.channels)
 
         raw = any(s.raw for s in self.sinks)
         read = served
@@ -344,12 +344,12 @@ class Engine:
 
         ``end_ns``: these are the last ones; estimators give what they hold.
         """
-        given: dict[int, Any] = {}
+        taken: dict[int, Any] = {}
         for level, runner in enumerate(self.runners, 1):
             feed = runner.feed
-            if id(feed) not in given:
-                given[id(feed)] = feed.take(part)
-            ready = given[id(feed)]
+            if id(feed) not in taken:
+                taken[id(feed)] = feed.take(part)
+            ready = taken[id(feed)]
             blocks = runner.take(ready) if len(ready) else {}
             if end_ns is not None:
                 blocks = joined_by_name([blocks, runner.finish(end_ns)])
@@ -363,12 +363,12 @@ class Engine:
     def _emit(self, topic: str, block: Block, raw: bool = False) -> None:
         before = self._written.get(topic, 0)
         after = self._written[topic] = before + len(block)
-        known = self._seen.get(topic, 0)
-        self._seen[topic] = max(known, after)
+        before_rewind = self._seen.get(topic, 0)
+        self._seen[topic] = max(before_rewind, after)
         for sink in self.sinks:
             if raw and not sink.raw:
                 continue
-            fresh = block if sink.rewinds else block.since(max(0, known - before))
+            fresh = block if sink.rewinds else block.since(max(0, before_rewind - before))
             if len(fresh):
                 sink.write_block(topic, fresh)
 

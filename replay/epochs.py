@@ -167,17 +167,17 @@ def gait_of(
     time = np.diff(end) * 1e-9
     timed = np.r_[False, here[1:] & (where[1:] == where[:-1]) & (time <= PAUSE_S)][: len(end)]
     time = time[timed[1:]]
-    found: dict[str, float] = {f"{word}s": int(here.sum()), "distance_m": float(np.nansum(length[here]))}
+    figures: dict[str, float] = {f"{word}s": int(here.sum()), "distance_m": float(np.nansum(length[here]))}
     if here.any():
-        found[f"{word}_length_m"] = float(length[here].mean())
+        figures[f"{word}_length_m"] = float(length[here].mean())
     if len(time):
         whole = float(time.sum())
-        found["cadence_per_min"] = (120.0 if one_foot else 60.0) * len(time) / whole
-        found[f"{word}_time_s"] = whole / len(time)
-        found["speed_m_s"] = float(length[timed].sum()) / whole
+        figures["cadence_per_min"] = (120.0 if one_foot else 60.0) * len(time) / whole
+        figures[f"{word}_time_s"] = whole / len(time)
+        figures["speed_m_s"] = float(length[timed].sum()) / whole
         if one_foot:
-            found["stance_share"] = 1.0 - float((end - start)[timed].sum() * 1e-9) / whole
+            figures["stance_share"] = 1.0 - float((end - start)[timed].sum() * 1e-9) / whole
     for name, values in ((f"{word}_time_cv", time), (f"{word}_length_cv", length[here])):
         if len(values) > 1 and values.mean():
-            found[name] = float(values.std(ddof=1) / values.mean())
-    return found
+            figures[name] = float(values.std(ddof=1) / values.mean())
+    return figures

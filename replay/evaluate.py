@@ -277,7 +277,7 @@ def recording_view(
     start_ns = start_ns if start_ns is not None else _number(lineage.get("range.start_ns"))
     end_ns = end_ns if end_ns is not None else _number(lineage.get("range.end_ns"))
     whole = start_ns is None and end_ns is None
-    known = {**(rec.metadata.get("truth", {}) if rec is not None else {}), **(truth or {})}
+    facts = {**(rec.metadata.get("truth", {}) if rec is not None else {}), **(truth or {})}
     topics = _track_references(rec, lineage.get("input", ""), reference) if rec is not None else (None, None)
     track, velocity = topics
     return RunView(
@@ -285,7 +285,7 @@ def recording_view(
         estimator=lineage.get("estimator", ""),
         lineage=lineage,
         output=output,
-        truth=truth_of({"truth": known}) if whole else Truth(),
+        truth=truth_of({"truth": facts}) if whole else Truth(),
         reference=rec.table(track) if rec is not None and track is not None else None,
         reference_velocity=rec.table(velocity) if rec is not None and velocity is not None else None,
         recording=rec,
@@ -385,14 +385,14 @@ def _groups(view: RunView, tier: pl.DataFrame) -> list[GroupEvaluation]:
     edges = np.r_[limits.min, covered.ravel(), limits.max].reshape(-1, 2)
     first, last = _extent(view)
     parts.append((None, int(((edges[:, 1] > first) & (edges[:, 0] <= last)).sum()), edges))
-    found = []
+    groups = []
     for label, count, spans in parts:
         part = view.part(spans)
         assert part.spans is not None
         inner = np.clip(part.spans, first, last)
         seconds = float((inner[:, 1] - inner[:, 0]).sum()) * 1e-9
-        found.append(GroupEvaluation(label, count, seconds, _measure(part), *_matched(part)))
-    return found
+        groups.append(GroupEvaluation(label, count, seconds, _measure(part), *_matched(part)))
+    return groups
 
 
 def _spans(start_ns: Any, end_ns: Any) -> IntArray:
@@ -426,13 +426,13 @@ def check_thresholds(
     UsageError
         A metric that no run has: a misspelt bound must not pass.
     """
-    known = list(dict.fromkeys(m for r in evaluation.runs for m in r.metrics))
+    names = list(dict.fromkeys(m for r in evaluation.runs for m in r.metrics))
     missed = []
     for kind, bounds in (("max", maximum or {}), ("min", minimum or {})):
         for metric, bound in bounds.items():
-            if metric not in known:
+            if metric not in names:
                 raise UsageError(
-                    f"--{kind} {metric}: no run has this metric; there are {', '.join(known) or 'none'}"
+                    f"--{kind} {metric}: no run has this metric; there are {', '.join(names) or 'none'}"
                 )
             for run in evaluation.runs:
                 value = run.metrics.get(metric)
@@ -467,17 +467,17 @@ def _some(table: pl.DataFrame, columns: Sequence[str]) -> pl.DataFrame:
 
 
 def _measure(view: RunView) -> dict[str, float]:
-    found: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     for name, metric in available_metrics().items():
         try:
-            found |= {k: float(v) for k, v in metric(view).items()}
+            metrics |= {k: float(v) for k, v in metric(view).items()}
         except MarchaError:
             raise
         except Exception as error:
             if (getattr(metric, "__module__", "") or "").startswith("marcha."):
                 raise
             warnings.warn(f"metric plug-in {name} failed on run {view.run}: {error}", stacklevel=2)
-    return found
+    return metrics
 
 
 def _matched(view: RunView) -> tuple[int, int]:

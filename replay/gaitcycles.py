@@ -68,17 +68,17 @@ def cycle_starts(
 
 def cycles(view: RunView) -> list[JointCycles]:
     """Return every joint of a run that has a reference, over its cycles; two cycles at least."""
-    found = []
-    for joint, at, estimate, reference in angles_beside(view):
-        starts, by = cycle_starts(view.annotations, joint, at, reference)
-        ours, theirs = cycles_of(at, estimate, starts), cycles_of(at, reference, starts)
+    result = []
+    for joint, t_ns, estimate, reference in angles_beside(view):
+        starts, by = cycle_starts(view.annotations, joint, t_ns, reference)
+        ours, theirs = cycles_of(t_ns, estimate, starts), cycles_of(t_ns, reference, starts)
         whole = np.isfinite(ours).all(axis=1) & np.isfinite(theirs).all(axis=1)
         if whole.sum() < 2:
             continue
         ours, theirs = ours[whole], theirs[whole]
         error = wrapped_deg(ours, theirs)
         bands = {"estimate": np.degrees(ours), "reference": np.degrees(theirs), "error": error}
-        found.append(
+        result.append(
             JointCycles(
                 joint=joint,
                 count=int(whole.sum()),
@@ -88,4 +88,4 @@ def cycles(view: RunView) -> list[JointCycles]:
                 **{f"{name}_sd": c.std(axis=0, ddof=1).round(4).tolist() for name, c in bands.items()},
             )
         )
-    return found
+    return result

@@ -146,54 +146,54 @@ class ChannelGuard:
         if state.stopped:
             state.after_stop += len(times)
             return np.zeros(len(times), bool), np.empty(0), ()
-        kept, known = finite, times
+        kept, stamped = finite, times
         if not finite.all():
             state.missing.add(times[~finite])
-            known = times[finite]
+            stamped = times[finite]
         last = state.last_ns if state.last_ns is not None else np.iinfo(np.int64).min
-        if known.size and (known[0] <= last or (known[1:] <= known[:-1]).any()):
-            latest = np.maximum.accumulate(np.concatenate(([last], known)))[:-1]
-            state.duplicate.add(known[known == latest])
-            state.backwards.add(known[known < latest])
-            later = known > latest
+        if stamped.size and (stamped[0] <= last or (stamped[1:] <= stamped[:-1]).any()):
+            latest = np.maximum.accumulate(np.concatenate(([last], stamped)))[:-1]
+            state.duplicate.add(stamped[stamped == latest])
+            state.backwards.add(stamped[stamped < latest])
+            later = stamped > latest
             kept = finite.copy()
             kept[np.flatnonzero(finite)[~later]] = False
-            known = known[later]
-        if not known.size:
+            stamped = stamped[later]
+        if not stamped.size:
             return kept, np.empty(0), ()
-        before = known[0] if state.last_ns is None else state.last_ns
-        dt_s = np.diff(known, prepend=before) / 1e9
+        before = stamped[0] if state.last_ns is None else state.last_ns
+        dt_s = np.diff(stamped, prepend=before) / 1e9
         gap = dt_s > self.limit_s
         resets: tuple[int, ...] = ()
         if gap.any():
             if self.gap.policy == "stop":
                 first = int(np.argmax(gap))
-                state.gaps.add(known[first : first + 1], dt_s[first : first + 1])
-                state.after_stop += len(known) - first
+                state.gaps.add(stamped[first : first + 1], dt_s[first : first + 1])
+                state.after_stop += len(stamped) - first
                 state.stopped = True
                 kept = kept.copy()
                 kept[np.flatnonzero(kept)[first:]] = False
-                known, dt_s, gap = known[:first], dt_s[:first], gap[:first]
+                stamped, dt_s, gap = stamped[:first], dt_s[:first], gap[:first]
             else:
-                state.gaps.add(known[gap], dt_s[gap])
+                state.gaps.add(stamped[gap], dt_s[gap])
                 if self.gap.policy == "reset":
                     resets = tuple(np.flatnonzero(gap).tolist())
                     dt_s[gap] = 0.0
         if self.rate_hz > 0:
             uneven = (dt_s > JITTER / self.rate_hz) & ~gap
-            state.jitter.add(known[uneven], dt_s[uneven])
-        if known.size:
-            state.last_ns = int(known[-1])
+            state.jitter.add(stamped[uneven], dt_s[uneven])
+        if stamped.size:
+            state.last_ns = int(stamped[-1])
         return None if kept.all() else kept, dt_s, resets
 
     def findings(self) -> list[Finding]:
         """Return what was not fed and what was uneven, one line a kind."""
         state = self._state
-        found: list[Finding] = []
+        findings: list[Finding] = []
 
         def say(kind: str, tally: Tally, detail: str) -> None:
             if tally.count:
-                found.append(Finding(kind, tally.count, None, f"{self.topic}: {tally.count} {detail}"))
+                findings.append(Finding(kind, tally.count, None, f"{self.topic}: {tally.count} {detail}"))
 
         columns = " ".join(self.columns)
         for kind, tally, rule in (
@@ -219,4 +219,4 @@ class ChannelGuard:
             f"intervals above {JITTER:g} usual ones ({1e3 / (self.rate_hz or np.inf):.4g} ms), the longest "
             f"{1e3 * state.jitter.largest:.4g} ms: fed with their true time difference",
         )
-        return found
+        return findings

@@ -120,11 +120,11 @@ def power_map_of(
         anchors = anchors_of(context)
     except AlgorithmError as error:
         raise UsageError(f"{rec.path}: {error}") from None
-    found = map_of(context, anchors, height_m)
-    if found is not None:
-        nx, ny = found.mean.shape[1:]
-        x, y = (found.low[k] + found.cell * np.arange(n) for k, n in enumerate((nx, ny)))
-        return PowerMap(x, y, found.mean, anchors, True)
+    radio_map = map_of(context, anchors, height_m)
+    if radio_map is not None:
+        nx, ny = radio_map.mean.shape[1:]
+        x, y = (radio_map.low[k] + radio_map.cell * np.arange(n) for k, n in enumerate((nx, ny)))
+        return PowerMap(x, y, radio_map.mean, anchors, True)
     low, high = anchors.plane.min(axis=0) - 2.0, anchors.plane.max(axis=0) + 2.0
     x, y = (np.linspace(low[k], high[k], 80) for k in (0, 1))
     gx, gy = np.meshgrid(x, y, indexing="ij")
@@ -182,12 +182,12 @@ def geometry_of(
             plane, one, low=tuple(low), high=tuple(high), cell_m=cell, reach_m=reach_m, heights=above
         )
 
-    found = maps()
-    gx, gy = np.meshgrid(found["x"], found["y"], indexing="ij")
+    plain = maps()
+    gx, gy = np.meshgrid(plain["x"], plain["y"], indexing="ij")
     walked = np.ones(gx.shape, dtype=bool)
     if raster is not None:
-        at = (np.stack([gx, gy]) - raster[0][:, None, None]) / raster[1]
-        i, j = (np.clip(a.astype(int), 0, n - 1) for a, n in zip(at, raster[2].shape, strict=True))
+        cells = (np.stack([gx, gy]) - raster[0][:, None, None]) / raster[1]
+        i, j = (np.clip(a.astype(int), 0, n - 1) for a, n in zip(cells, raster[2].shape, strict=True))
         walked = raster[2][i, j] > 0
     places = np.column_stack([gx[walked], gy[walked]])
     tried = places[:: max(1, len(places) // CANDIDATES)]
@@ -199,11 +199,11 @@ def geometry_of(
         return np.where(walked, values, np.nan)
 
     return Geometry(
-        found["x"],
-        found["y"],
-        shown(found["bound_m"]),
-        shown(found["dilution"]),
-        shown(found["heard"]),
+        plain["x"],
+        plain["y"],
+        shown(plain["bound_m"]),
+        shown(plain["dilution"]),
+        shown(plain["heard"]),
         best,
         shown(more["bound_m"]),
         anchors,

@@ -44,10 +44,10 @@ def leave_one_out(
     """
     if len(recordings) < 2:
         raise UsageError("leave one out: two recordings at least, so that one is left to calibrate from")
-    found: dict[str, list[Run]] = {}
+    runs: dict[str, list[Run]] = {}
     for k, rec in enumerate(recordings):
         others = [r for i, r in enumerate(recordings) if i != k]
-        found[str(rec.path)] = list(
+        runs[str(rec.path)] = list(
             replay(rec, list(estimators), calibrations=calibrate(calibration, others, params)).runs
         )
-    return found
+    return runs

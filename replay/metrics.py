@@ -31,10 +31,10 @@ def closure(view: RunView) -> dict[str, float]:
         return {}
     way = view.track.position[-1] - view.track.position[0]
     metres = float(np.hypot(way[0], way[1]))
-    found = {"closure_m": metres}
+    metrics = {"closure_m": metres}
     if view.truth.closed and view.truth.length_m:
-        found["closure_percent"] = 100.0 * metres / view.truth.length_m
-    return found
+        metrics["closure_percent"] = 100.0 * metres / view.truth.length_m
+    return metrics
 
 
 def distance(view: RunView) -> dict[str, float]:
@@ -42,39 +42,39 @@ def distance(view: RunView) -> dict[str, float]:
 
     The source's ED is eq 4.4.
     """
-    found: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     steps = view.table("step")
     if steps is not None:
-        found["steps"] = float(steps.height)
+        metrics["steps"] = float(steps.height)
         if view.truth.steps:
-            found["steps_difference"] = steps.height - view.truth.steps
-            found["steps_error_percent"] = 100.0 * abs(steps.height - view.truth.steps) / view.truth.steps
+            metrics["steps_difference"] = steps.height - view.truth.steps
+            metrics["steps_error_percent"] = 100.0 * abs(steps.height - view.truth.steps) / view.truth.steps
     base = view.whole or view
     track = base.track
     if track is None:
-        return found
+        return metrics
     first, last = track.t_ns[0], track.t_ns[-1]
     stances = base.stances[(base.stances[:, 1] >= first) & (base.stances[:, 0] <= last)]
     # The track begins within the rest at the start: that stance counts from where there is a track.
     middles = np.clip(stances, first, last).mean(axis=1).astype(np.int64)
-    at = np.searchsorted(track.t_ns, middles)
-    if at.size:
-        found["distance_m"] = _length(middles, track.position[at], view.spans)
+    rows = np.searchsorted(track.t_ns, middles)
+    if rows.size:
+        metrics["distance_m"] = _length(middles, track.position[rows], view.spans)
     elif (
         steps is not None and "length_m" in steps.columns and np.isfinite(steps["length_m"].to_numpy()).all()
     ):
-        found["distance_m"] = float(steps["length_m"].sum())
-    found["path_m"] = _length(track.t_ns, track.position, view.spans)
+        metrics["distance_m"] = float(steps["length_m"].sum())
+    metrics["path_m"] = _length(track.t_ns, track.position, view.spans)
     if (length := view.truth.length_m) is not None:
-        if "distance_m" in found:
-            found["distance_difference_m"] = found["distance_m"] - length
+        if "distance_m" in metrics:
+            metrics["distance_difference_m"] = metrics["distance_m"] - length
         for name, metres in (
-            ("distance_error_percent", found.get("distance_m")),
-            ("path_error_percent", found["path_m"]),
+            ("distance_error_percent", metrics.get("distance_m")),
+            ("path_error_percent", metrics["path_m"]),
         ):
             if metres is not None:
-                found[name] = 100.0 * abs(metres - length) / length
-    return found
+                metrics[name] = 100.0 * abs(metres - length) / length
+    return metrics
 
 
 def _length(t_ns: IntArray, position: FloatArray, spans: IntArray | None) -> float:
@@ -95,10 +95,10 @@ def height(view: RunView) -> dict[str, float]:
     if view.track is None or view.scattered:
         return {}
     z = view.track.position[:, 2]
-    found = {"height_end_m": float(z[-1] - z[0])}
+    metrics = {"height_end_m": float(z[-1] - z[0])}
     if view.truth.closed:
-        found["height_error_m"] = abs(found["height_end_m"])
-    return found
+        metrics["height_error_m"] = abs(metrics["height_end_m"])
+    return metrics
 
 
 def reference(view: RunView) -> dict[str, float]:
@@ -107,7 +107,7 @@ def reference(view: RunView) -> dict[str, float]:
     if compared is None:
         return {}
     error = np.linalg.norm(compared.error, axis=1)
-    found = {
+    metrics = {
         "ate_rmse_m": float(np.sqrt(np.mean(error**2))),
         "position_error_mean_m": float(error.mean()),
         "position_error_median_m": float(np.median(error)),
@@ -118,15 +118,15 @@ def reference(view: RunView) -> dict[str, float]:
     }
     if (start := view.compared("origin")) is not None and not view.scattered:
         x, y = np.abs(start.error[-1, :2]).tolist()
-        found |= {"origin_error_end_x_m": x, "origin_error_end_y_m": y}
+        metrics |= {"origin_error_end_x_m": x, "origin_error_end_y_m": y}
     if compared.yaw_error is not None:
         drift = np.degrees(wrap(compared.yaw_error - compared.yaw_start))
-        found["heading_rmse_deg"] = float(np.sqrt(np.mean(drift**2)))
-        found["heading_error_end_deg"] = float(drift[-1])
+        metrics["heading_rmse_deg"] = float(np.sqrt(np.mean(drift**2)))
+        metrics["heading_error_end_deg"] = float(drift[-1])
     velocity = _velocity_error(view, compared.transform)
     if velocity is not None:
-        found["velocity_rmse_m_s"] = float(np.sqrt(np.mean(np.sum(velocity[1] ** 2, axis=1))))
-    return found
+        metrics["velocity_rmse_m_s"] = float(np.sqrt(np.mean(np.sum(velocity[1] ** 2, axis=1))))
+    return metrics
 
 
 def _velocity_error(view: RunView, transform: Transform) -> tuple[IntArray, FloatArray] | None:
@@ -139,11 +139,11 @@ def _velocity_error(view: RunView, transform: Transform) -> tuple[IntArray, Floa
         return None
     reference = reference.unique("t_ns", keep="first", maintain_order=True)
     t_ns = table["t_ns"].to_numpy()
-    found = match(t_ns, reference["t_ns"].to_numpy(), view.max_gap_s)
-    if not len(found.index):
+    pairs = match(t_ns, reference["t_ns"].to_numpy(), view.max_gap_s)
+    if not len(pairs.index):
         return None
-    ours = transform.vectors(table.select(VELOCITY).to_numpy()[found.index])
-    return t_ns[found.index], ours - found.linear(reference.select(VELOCITY).to_numpy())
+    ours = transform.vectors(table.select(VELOCITY).to_numpy()[pairs.index])
+    return t_ns[pairs.index], ours - pairs.linear(reference.select(VELOCITY).to_numpy())
 
 
 def consistency(view: RunView) -> dict[str, float]:
@@ -156,16 +156,18 @@ def consistency(view: RunView) -> dict[str, float]:
     compared = view.compared("origin-yaw")
     if compared is None or not compared.on_estimate or (sigma := view.table("sigma")) is None:
         return {}  # a table of standard deviations is large: it is read where it is needed
-    found = _normalized(sigma, "pos", "position", compared.t_ns, compared.error @ compared.transform.rotation)
+    metrics = _normalized(
+        sigma, "pos", "position", compared.t_ns, compared.error @ compared.transform.rotation
+    )
     velocity = _velocity_error(view, compared.transform)
     if velocity is not None:
         t_ns, error = velocity
-        found |= _normalized(sigma, "vel", "velocity", t_ns, error @ compared.transform.rotation)
+        metrics |= _normalized(sigma, "vel", "velocity", t_ns, error @ compared.transform.rotation)
     attitude = _attitude_error(view, compared.t_ns, compared.transform)
     if attitude is not None:
-        found |= _normalized(sigma, "att", "attitude", compared.t_ns, attitude)
-        found["attitude_rmse_deg"] = float(np.degrees(np.sqrt(np.mean(np.sum(attitude**2, axis=1)))))
-    return found
+        metrics |= _normalized(sigma, "att", "attitude", compared.t_ns, attitude)
+        metrics["attitude_rmse_deg"] = float(np.degrees(np.sqrt(np.mean(np.sum(attitude**2, axis=1)))))
+    return metrics
 
 
 SAME_BODY_DEG = 10.0
@@ -205,10 +207,10 @@ def _normalized(
         return {}
     _, mine, theirs = np.intersect1d(t_ns, sigma["t_ns"].to_numpy(), return_indices=True)
     sd = sigma.select(columns).to_numpy()[theirs]
-    known = np.isfinite(sd).all(axis=1) & (sd > 0).all(axis=1)
-    if not known.any():
+    stated = np.isfinite(sd).all(axis=1) & (sd > 0).all(axis=1)
+    if not stated.any():
         return {}
-    ratio = error[mine][known] / sd[known]
+    ratio = error[mine][stated] / sd[stated]
     squared = np.sum(ratio**2, axis=1)
     return {
         f"nees_{name}": float(squared.mean()),

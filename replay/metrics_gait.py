@@ -19,5 +19,5 @@ def gait(view: RunView) -> dict[str, float]:
     steps = base.table("step")
     if steps is None or not {"start_ns", "end_ns", "length_m"} <= set(steps.columns) or steps.is_empty():
         return {}
-    found = gait_of(steps, view.spans, one_foot=base.has("stance"))
-    return {k: v for k, v in found.items() if k not in ("steps", "distance_m")}
+    metrics = gait_of(steps, view.spans, one_foot=base.has("stance"))
+    return {k: v for k, v in metrics.items() if k not in ("steps", "distance_m")}

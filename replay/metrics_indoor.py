@@ -27,15 +27,15 @@ def indoor(view: RunView) -> dict[str, float]:
     compared = on_plan(view)
     if compared is None:
         return {}
-    found = _ellipse(view, compared)
+    metrics = _ellipse(view, compared)
     table = position_errors(view)
     assert table is not None
     for column, name in (("zone", "{}"), ("heard", "heard{}")):
         for key, part in table.filter(pl.col(column).is_not_null()).group_by(column, maintain_order=True):
             if part.height >= FEW and key[0] != "":
                 label = name.format(str(key[0]).replace(" ", "_"))
-                found[f"position_error_mean_m.{label}"] = float(part["error_m"].to_numpy().mean())
-    return found
+                metrics[f"position_error_mean_m.{label}"] = float(part["error_m"].to_numpy().mean())
+    return metrics
 
 
 def on_plan(view: RunView) -> Comparison | None:
@@ -80,12 +80,12 @@ def zones_of(plan: bytes | None) -> dict[str, Any]:
         return {}
     import shapely
 
-    found: dict[str, Any] = {}
+    zones: dict[str, Any] = {}
     for feature in json.loads(plan).get("features", ()):
         facts = feature.get("properties") or {}
         if facts.get("kind") in ("zone", "room") and facts.get("name") and feature.get("geometry"):
-            found.setdefault(str(facts["name"]), shapely.geometry.shape(feature["geometry"]))
-    return found
+            zones.setdefault(str(facts["name"]), shapely.geometry.shape(feature["geometry"]))
+    return zones
 
 
 def zone_at(zones: Mapping[str, Any], places: FloatArray) -> list[str]:
@@ -105,8 +105,8 @@ def _ellipse(view: RunView, compared: Comparison) -> dict[str, float]:
     if sigma is None or not {"sigma_pos_x", "sigma_pos_y"} <= set(sigma.columns) or sigma.is_empty():
         return {}
     sigma = sigma.unique("t_ns", keep="last", maintain_order=True)
-    at = np.clip(np.searchsorted(sigma["t_ns"].to_numpy(), compared.t_ns, "right") - 1, 0, None)
-    sd = sigma.select("sigma_pos_x", "sigma_pos_y").to_numpy()[at]
+    newest = np.clip(np.searchsorted(sigma["t_ns"].to_numpy(), compared.t_ns, "right") - 1, 0, None)
+    sd = sigma.select("sigma_pos_x", "sigma_pos_y").to_numpy()[newest]
     cov = np.zeros((len(sd), 2, 2))
     cov[:, 0, 0], cov[:, 1, 1] = sd[:, 0] ** 2, sd[:, 1] ** 2
     ratio = squared(compared.error[:, :2], cov)

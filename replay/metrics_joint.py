@@ -119,10 +119,10 @@ def consistency(error_deg: FloatArray, sigma_deg: FloatArray) -> dict[str, float
 
     Errors count with their mean: a mounting that is off, a reference's own error and delay are in them.
     """
-    known = np.isfinite(sigma_deg) & (sigma_deg > 0.0)
-    if not known.any():
+    stated = np.isfinite(sigma_deg) & (sigma_deg > 0.0)
+    if not stated.any():
         return {}
-    ratio = np.square(error_deg[known] / sigma_deg[known])
+    ratio = np.square(error_deg[stated] / sigma_deg[stated])
     return {
         "within95_percent": float(100.0 * np.mean(ratio <= 1.959964**2)),
         "nees": float(np.mean(ratio)),
@@ -153,16 +153,16 @@ def cycles_of(
     A cycle lies between two neighbouring starts; longer ones than ``most_s`` are pauses and left out.
     """
     starts = np.asarray(starts_ns, np.int64)
-    found: list[FloatArray] = []
+    curves: list[FloatArray] = []
     for a, b in pairwise(starts.tolist()):
         if b - a > most_s * 1e9 or a < t_ns[0] or b > t_ns[-1]:
             continue
-        at = a + np.linspace(0.0, float(b - a), POINTS)
-        k = np.clip(np.searchsorted(t_ns, at), 1, len(t_ns) - 1)
-        curve = np.interp(at - a, (t_ns - a).astype(np.float64), angle)
+        grid = a + np.linspace(0.0, float(b - a), POINTS)
+        k = np.clip(np.searchsorted(t_ns, grid), 1, len(t_ns) - 1)
+        curve = np.interp(grid - a, (t_ns - a).astype(np.float64), angle)
         curve[(t_ns[k] - t_ns[k - 1]) > GAP_NS] = np.nan
-        found.append(curve)
-    return np.array(found) if found else np.empty((0, POINTS))
+        curves.append(curve)
+    return np.array(curves) if curves else np.empty((0, POINTS))
 
 
 def starts_from_signal(t_ns: IntArray, angle: FloatArray, least_s: float = 0.6) -> IntArray:
@@ -185,16 +185,16 @@ def events_of(annotations: pl.DataFrame, joint: str) -> IntArray:
 
     A joint without a side takes events without a side, else those of the only side there is.
     """
-    found: dict[str, list[int]] = {}
+    starts: dict[str, list[int]] = {}
     for start, label in annotations.select("start_ns", "label").iter_rows() if annotations.height else ():
         words = [w for w in re.split(r"[^a-z]+", (label or "").lower()) if w]
         side = next((_SIDES[w] for w in words if w in _SIDES), "")
         if _EVENT.fullmatch("".join(w for w in words if w not in _SIDES)):
-            found.setdefault(side, []).append(start)
+            starts.setdefault(side, []).append(start)
     wanted = next((side for side in ("left", "right") if joint.startswith(f"{side}_")), "")
-    chosen = found.get(wanted, [])
-    if not chosen and not wanted and len(found) == 1:
-        chosen = next(iter(found.values()))
+    chosen = starts.get(wanted, [])
+    if not chosen and not wanted and len(starts) == 1:
+        chosen = next(iter(starts.values()))
     return np.unique(np.array(chosen, np.int64))
 
 
@@ -227,43 +227,45 @@ def figures(
     Cycles are those of the whole walk that lie in a stretch whole; ``starts_ns`` of cycles count instead of the
     signal's. ``stated`` are the standard deviations that the estimate states (ns, rad).
     """
-    at, value, truth = matched(t_ns, angle, ref_ns, reference)
-    starts = starts_from_signal(at, truth) if starts_ns is None else starts_ns
+    times, value, truth = matched(t_ns, angle, ref_ns, reference)
+    starts = starts_from_signal(times, truth) if starts_ns is None else starts_ns
     parts = [starts] if spans is None else [starts[inside(starts, s[None])] for s in spans]
-    curves = [(cycles_of(at, value, p), cycles_of(at, truth, p)) for p in parts if at.size]
+    curves = [(cycles_of(times, value, p), cycles_of(times, truth, p)) for p in parts if times.size]
     if spans is not None:
-        keep = inside(at, spans)
-        at, value, truth = at[keep], value[keep], truth[keep]
-    if at.size == 0:
+        keep = inside(times, spans)
+        times, value, truth = times[keep], value[keep], truth[keep]
+    if times.size == 0:
         return {}
     error = wrapped_deg(value, truth)
     low, high = bland_altman_deg(error)
     good = np.isfinite(angle)
-    found = {
-        "samples": float(at.size),
+    metrics = {
+        "samples": float(times.size),
         "rmse_deg": rmse_deg(error),
         "rmse_unbiased_deg": rmse_unbiased_deg(error),
         "bias_deg": bias_deg(error),
         "pearson_r": pearson_r(value, truth),
         "rom_error_deg": rom_error_deg(value, truth),
-        "delay_s": delay_s(t_ns[good], np.unwrap(angle[good]), at, truth),
+        "delay_s": delay_s(t_ns[good], np.unwrap(angle[good]), times, truth),
         "agreement_low_deg": low,
         "agreement_high_deg": high,
     }
     if stated is not None:
-        found.update(consistency(error, np.degrees(np.interp(at - t_ns[0], stated[0] - t_ns[0], stated[1]))))
+        metrics.update(
+            consistency(error, np.degrees(np.interp(times - t_ns[0], stated[0] - t_ns[0], stated[1])))
+        )
     ours, theirs = (np.concatenate(c) for c in zip(*curves, strict=True))
     whole = np.isfinite(ours).all(axis=1) & np.isfinite(theirs).all(axis=1)
     if whole.sum() >= 2:
         ours, theirs = ours[whole], theirs[whole]
         each = wrapped_deg(ours, theirs)
-        found["cycles"] = float(len(ours))
-        found["cycle_rmse_deg"] = float(np.mean(np.sqrt(np.mean(each**2, axis=1))))
-        found["cycle_rom_error_deg"] = float(
+        metrics["cycles"] = float(len(ours))
+        metrics["cycle_rmse_deg"] = float(np.mean(np.sqrt(np.mean(each**2, axis=1))))
+        metrics["cycle_rom_error_deg"] = float(
             np.degrees(np.mean(np.ptp(ours, axis=1) - np.ptp(theirs, axis=1)))
         )
-        found["cmc"] = float(np.mean([cmc(np.stack(pair)) for pair in zip(ours, theirs, strict=True)]))
-    return found
+        metrics["cmc"] = float(np.mean([cmc(np.stack(pair)) for pair in zip(ours, theirs, strict=True)]))
+    return metrics
 
 
 def joints(view: RunView) -> dict[str, float]:
@@ -272,13 +274,13 @@ def joints(view: RunView) -> dict[str, float]:
     """
     base = view.whole or view
     sigma = base.table("sigma")
-    found: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     for name, own, truth, sign in _pairs(base):
         events = events_of(base.annotations, name)
         starts = events if len(events) >= LEAST_EVENTS else None
         values = figures(own[0], own[1], truth[0], sign * truth[1], starts, view.spans, _stated(sigma, name))
-        found.update({f"{key}.{name}": value for key, value in values.items()})
-    return found
+        metrics.update({f"{key}.{name}": value for key, value in values.items()})
+    return metrics
 
 
 def attitudes(view: RunView) -> dict[str, float]:
@@ -287,7 +289,7 @@ def attitudes(view: RunView) -> dict[str, float]:
     ours = base.table("attitude")
     if ours is None:
         return {}
-    found: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     sigma = base.table("sigma")
     tables = base.reference_tables("orientation")
     for topic in sorted(tables, key=len, reverse=True):  # a source's own goes before those made of markers
@@ -312,18 +314,18 @@ def attitudes(view: RunView) -> dict[str, float]:
                 spans=view.spans,
                 stated=_stated(sigma, name),
             )
-            found.update({f"{key}.{name}": v for key, v in values.items() if key in ATTITUDE_FIGURES})
-    return found
+            metrics.update({f"{key}.{name}": v for key, v in values.items() if key in ATTITUDE_FIGURES})
+    return metrics
 
 
 def angles_beside(view: RunView) -> list[tuple[str, IntArray, FloatArray, FloatArray]]:
     """Return joint, times, estimate and reference (rad) at them, of every joint that has a reference."""
-    found = []
+    result = []
     for name, own, truth, sign in _pairs(view):
-        at, estimate, reference = matched(*own, truth[0], sign * truth[1])
-        if at.size:
-            found.append((name, at, estimate, reference))
-    return found
+        t_ns, estimate, reference = matched(*own, truth[0], sign * truth[1])
+        if t_ns.size:
+            result.append((name, t_ns, estimate, reference))
+    return result
 
 
 def doubts(view: RunView) -> list[str]:
@@ -331,23 +333,25 @@ def doubts(view: RunView) -> list[str]:
     ours, truth = view.table("joint"), view.reference_table("joint")
     if ours is None or truth is None:
         return []
-    found = []
+    result = []
     for name in joint_columns(ours):
         if reference_column(name, joint_columns(truth)) is None:
             there = ", ".join(
                 c for c in joint_columns(truth) if _side_and_joint(c)[1] == _side_and_joint(name)[1]
             )
             if there:
-                found.append(f"{name}: the reference has {there}; convert it with --set side=left (or right)")
+                result.append(
+                    f"{name}: the reference has {there}; convert it with --set side=left (or right)"
+                )
     beside = angles_beside(view)
-    found += _coverage(ours, truth, sum(at.size for _, at, _, _ in beside))
-    for name, at, estimate, reference in beside:
-        if at.size > 100 and pearson_r(estimate, reference) < -0.5:
-            found.append(
+    result += _coverage(ours, truth, sum(t_ns.size for _, t_ns, _, _ in beside))
+    for name, t_ns, estimate, reference in beside:
+        if t_ns.size > 100 and pearson_r(estimate, reference) < -0.5:
+            result.append(
                 f"{name}: turns against its reference (r {pearson_r(estimate, reference):.2f}): reverse the flexion "
                 "axis (-p axis=-x), or check which sensor is on which segment"
             )
-    return found
+    return result
 
 
 def _coverage(ours: pl.DataFrame, truth: pl.DataFrame, compared: int) -> list[str]:
@@ -377,12 +381,12 @@ def _pairs(view: RunView) -> list[tuple[str, Series, Series, float]]:
     ours, truth = view.table("joint"), view.reference_table("joint")
     if ours is None or truth is None:
         return []
-    found = []
+    pairs = []
     for name in joint_columns(ours):
         column = reference_column(name, joint_columns(truth))
         if column is not None:
-            found.append((name, _column(ours, name), _column(truth, column[0]), column[1]))
-    return found
+            pairs.append((name, _column(ours, name), _column(truth, column[0]), column[1]))
+    return pairs
 
 
 def reference_column(joint: str, columns: Sequence[str]) -> tuple[str, float] | None:
@@ -394,13 +398,13 @@ def reference_column(joint: str, columns: Sequence[str]) -> tuple[str, float] | 
     if joint in columns:
         return joint, 1.0
     side, plain = _side_and_joint(joint)
-    found = []
+    fitting = []
     for column in columns:
         its_side, its = _side_and_joint(column)
         if its == plain and (not side or not its_side or its_side == side):
             foreign = column != its and not column.startswith(("left_", "right_"))
-            found.append((column, -1.0 if foreign and plain in ("hip", "ankle") else 1.0))
-    return found[0] if len(found) == 1 else None
+            fitting.append((column, -1.0 if foreign and plain in ("hip", "ankle") else 1.0))
+    return fitting[0] if len(fitting) == 1 else None
 
 
 def _side_and_joint(name: str) -> tuple[str, str]:

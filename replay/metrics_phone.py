@@ -28,23 +28,23 @@ def phone(view: RunView) -> dict[str, float]:
     ours, truth = base.table("step"), base.reference_table("steps")
     if ours is None or truth is None or truth.is_empty():
         return {}
-    found: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     mine, theirs = _ends(ours), _ends(truth)
     offset = constant_offset(mine, theirs)
     here, there = matched(mine - offset, theirs)
     if view.spans is not None:  # partners are found in the whole walk; each side counts where it lies itself
-        own, known = inside(mine, view.spans), inside(theirs, view.spans)
-        here, there = here[own[here]], there[known[there]]
-        mine, theirs = mine[own], theirs[known]
+        own, theirs_inside = inside(mine, view.spans), inside(theirs, view.spans)
+        here, there = here[own[here]], there[theirs_inside[there]]
+        mine, theirs = mine[own], theirs[theirs_inside]
     if not theirs.size:
         return {}
     if not view.truth.steps:  # else it is measured against what the recording states
-        found["steps_error_percent"] = 100.0 * abs(mine.size - theirs.size) / theirs.size
-    found["steps_recall"] = there.size / theirs.size
+        metrics["steps_error_percent"] = 100.0 * abs(mine.size - theirs.size) / theirs.size
+    metrics["steps_recall"] = there.size / theirs.size
     if mine.size:
-        found["steps_precision"] = here.size / mine.size
-        found["steps_offset_s"] = offset * 1e-9
-    return found
+        metrics["steps_precision"] = here.size / mine.size
+        metrics["steps_offset_s"] = offset * 1e-9
+    return metrics
 
 
 def _ends(table: pl.DataFrame) -> IntArray:
@@ -88,5 +88,5 @@ def matched(mine: IntArray, theirs: IntArray, tolerance_ns: int = TOLERANCE_NS) 
             i += 1
         else:
             j += 1
-    found = np.array(pairs, np.int64).reshape(-1, 2)
-    return found[:, 0], found[:, 1]
+    matches = np.array(pairs, np.int64).reshape(-1, 2)
+    return matches[:, 0], matches[:, 1]

@@ -78,22 +78,22 @@ def places(view: RunView) -> dict[str, float]:
     plane = Plane(ours["lat_deg"][0], ours["lon_deg"][0])
     track = Places(ours["t_ns"].to_numpy(), plane(ours), stated_covariances(ours, view.table("state")))
     raw = _raw_fixes(view)
-    found = _radius(track.cov)
+    metrics = _radius(track.cov)
     reference = usable(view.reference_table("fix")) if view.recording is not None else None
     survey = usable(view.survey)
     if reference is not None:
         there = reference["t_ns"].to_numpy()
         if there[0] <= track.t_ns[-1] and track.t_ns[0] <= there[-1]:
-            found |= _beside(track, there, plane(reference), "fix_error")
+            metrics |= _beside(track, there, plane(reference), "fix_error")
             if raw is not None:
-                found |= _errors(
+                metrics |= _errors(
                     _against(raw["t_ns"].to_numpy(), plane(raw), there, plane(reference))[0], "raw_fix_error"
                 )
         elif survey is None:
             survey = reference
     if survey is not None and (line := SurveyLine.through(plane(survey))) is not None:
-        found |= _along(track, line, None if raw is None else plane(raw))
-    return found | _losses(view, track, plane, reference)
+        metrics |= _along(track, line, None if raw is None else plane(raw))
+    return metrics | _losses(view, track, plane, reference)
 
 
 def usable(table: pl.DataFrame | None) -> pl.DataFrame | None:
@@ -140,10 +140,10 @@ def squared(error: FloatArray, cov: FloatArray) -> FloatArray:
     """Return the normalized errors squared eᵀ P⁻¹ e of shape (n,); NaN where P is not positive definite."""
     out = np.full(len(error), np.nan)
     det = cov[:, 0, 0] * cov[:, 1, 1] - cov[:, 0, 1] ** 2
-    known = np.isfinite(det) & (det > 0) & (cov[:, 0, 0] > 0)
-    x, y = error[known, 0], error[known, 1]
-    a, b, c = cov[known, 0, 0], cov[known, 0, 1], cov[known, 1, 1]
-    out[known] = (c * x * x - 2 * b * x * y + a * y * y) / det[known]
+    stated = np.isfinite(det) & (det > 0) & (cov[:, 0, 0] > 0)
+    x, y = error[stated, 0], error[stated, 1]
+    a, b, c = cov[stated, 0, 0], cov[stated, 0, 1], cov[stated, 1, 1]
+    out[stated] = (c * x * x - 2 * b * x * y + a * y * y) / det[stated]
     return out
 
 
@@ -151,8 +151,8 @@ def _against(
     t_ns: IntArray, xy: FloatArray, there: IntArray, reference: FloatArray
 ) -> tuple[FloatArray, IntArray]:
     """Return errors at the times that the reference has, and which they are."""
-    found = match(t_ns, there, REFERENCE_GAP_S)
-    return xy[found.index] - found.linear(reference), found.index
+    pairs = match(t_ns, there, REFERENCE_GAP_S)
+    return xy[pairs.index] - pairs.linear(reference), pairs.index
 
 
 def _errors(error: FloatArray, name: str) -> dict[str, float]:
@@ -177,13 +177,13 @@ def _beside(track: Places, there: IntArray, reference: FloatArray, name: str) ->
 def _consistency(error: FloatArray, cov: FloatArray) -> dict[str, float]:
     """Return how the errors fit what is stated of them."""
     ratio = squared(error, cov)
-    known = np.isfinite(ratio)
-    if not known.any():
+    stated = np.isfinite(ratio)
+    if not stated.any():
         return {}
     return {
-        "ellipse95_percent": float(100.0 * np.mean(ratio[known] <= ELLIPSE95)),
-        "nees_horizontal": float(ratio[known].mean()),
-        "nees_horizontal_end": float(ratio[known][-1]),
+        "ellipse95_percent": float(100.0 * np.mean(ratio[stated] <= ELLIPSE95)),
+        "nees_horizontal": float(ratio[stated].mean()),
+        "nees_horizontal_end": float(ratio[stated][-1]),
     }
 
 
@@ -195,10 +195,10 @@ def waypoint_ellipse(view: RunView) -> dict[str, float]:
     sigma, cov = view.table("sigma"), _local_covariances(view)
     if sigma is None or not len(cov):
         return {}
-    at = np.searchsorted(sigma["t_ns"].to_numpy(), compared.t_ns, "right") - 1
-    later = at[1:] >= 0  # the first one has no error by definition
-    begin = cov[at[0]] if at[0] >= 0 else np.zeros((2, 2))
-    grown = cov[np.maximum(at[1:], 0)] - begin
+    newest = np.searchsorted(sigma["t_ns"].to_numpy(), compared.t_ns, "right") - 1
+    later = newest[1:] >= 0  # the first one has no error by definition
+    begin = cov[newest[0]] if newest[0] >= 0 else np.zeros((2, 2))
+    grown = cov[np.maximum(newest[1:], 0)] - begin
     return _consistency(compared.error[1:, :2][later], grown[later])
 
 
@@ -278,10 +278,10 @@ def by_shape(points: FloatArray, line: SurveyLine) -> FloatArray:
     for _ in range(SHAPE_ROUNDS):
         there, inside = line.nearest(moved)
         try:
-            found = horn(moved[inside], there[inside], scale=False)
+            fitted = horn(moved[inside], there[inside], scale=False)
         except AlgorithmError:
             return points
-        change = found.apply(moved) - moved
+        change = fitted.apply(moved) - moved
         moved = moved + change
         if np.abs(change).max() < 1e-3:
             break
@@ -290,36 +290,36 @@ def by_shape(points: FloatArray, line: SurveyLine) -> FloatArray:
 
 def _along(track: Places, line: SurveyLine, raw: FloatArray | None) -> dict[str, float]:
     """Return distances to a survey's line, without and with alignment by shape, and those of the raw fixes."""
-    found = _off(track.xy, line, "line")
-    found |= _off(by_shape(track.xy, line), line, "line_shape")
+    metrics = _off(track.xy, line, "line")
+    metrics |= _off(by_shape(track.xy, line), line, "line_shape")
     if raw is not None:
-        found |= _off(raw, line, "raw_line")
+        metrics |= _off(raw, line, "raw_line")
     there, inside = line.nearest(track.xy)
-    found["line_covered_percent"] = float(100.0 * inside.mean())
+    metrics["line_covered_percent"] = float(100.0 * inside.mean())
     across = _across((track.xy - there)[inside], track.cov[inside])
     if len(across):
-        found["line_within95_percent"] = float(100.0 * np.mean(across <= 1.959964))
-    return found
+        metrics["line_within95_percent"] = float(100.0 * np.mean(across <= 1.959964))
+    return metrics
 
 
 def _off(points: FloatArray, line: SurveyLine, name: str) -> dict[str, float]:
     there, inside = line.nearest(points)
     away = np.hypot(*(points - there).T)
-    found = {}
+    metrics = {}
     for part, chosen in (("", away[inside]), ("_all", away)):
         if len(chosen):
-            found[f"{name}{part}_median_m"] = float(np.median(chosen))
-            found[f"{name}{part}_p95_m"] = float(np.percentile(chosen, 95))
-    return found
+            metrics[f"{name}{part}_median_m"] = float(np.median(chosen))
+            metrics[f"{name}{part}_p95_m"] = float(np.percentile(chosen, 95))
+    return metrics
 
 
 def _across(off: FloatArray, cov: FloatArray) -> FloatArray:
     """Return distances to the line over the deviation that is stated across it."""
     away = np.hypot(*off.T)
-    known = (away > 1e-9) & np.isfinite(cov).all(axis=(1, 2))
-    normal = off[known] / away[known, None]
-    variance = np.einsum("ni,nij,nj->n", normal, cov[known], normal)
-    return away[known][variance > 0] / np.sqrt(variance[variance > 0])
+    stated = (away > 1e-9) & np.isfinite(cov).all(axis=(1, 2))
+    normal = off[stated] / away[stated, None]
+    variance = np.einsum("ni,nij,nj->n", normal, cov[stated], normal)
+    return away[stated][variance > 0] / np.sqrt(variance[variance > 0])
 
 
 # -- loss of the signal -------------------------------------------------------------------------------------
@@ -349,18 +349,18 @@ def _losses(view: RunView, track: Places, plane: Plane, reference: pl.DataFrame 
         within = np.flatnonzero((there >= start) & (there < end))
         if not before.any() or not len(within) or there[within[-1]] < end - 1e9 * (REFERENCE_GAP_S + 10):
             continue
-        at = int(there[within[-1]])
-        known = Places(track.t_ns[before], track.xy[before], track.cov[before])
-        mine = _at(known, steps, at)
+        last = int(there[within[-1]])
+        before_loss = Places(track.t_ns[before], track.xy[before], track.cov[before])
+        mine = _at(before_loss, steps, last)
         error = mine - xy[within[-1]]
         size.append(float(np.hypot(*error)))
-        ratio.append(squared(error[None], known.cov[-1:])[0])
+        ratio.append(squared(error[None], before_loss.cov[-1:])[0])
     if not size:
         return {}
-    found = {"loss_error_m": float(np.mean(size)), "loss_error_max_m": float(np.max(size))}
+    metrics = {"loss_error_m": float(np.mean(size)), "loss_error_max_m": float(np.max(size))}
     if np.isfinite(ratio).any():
-        found["loss_ellipse95_percent"] = float(100.0 * np.mean(np.array(ratio) <= ELLIPSE95))
-    return found
+        metrics["loss_ellipse95_percent"] = float(100.0 * np.mean(np.array(ratio) <= ELLIPSE95))
+    return metrics
 
 
 def _at(track: Places, steps: pl.DataFrame | None, t_ns: int) -> FloatArray:

@@ -212,12 +212,12 @@ class _Planner:
         """Return the estimators that serve this one's inputs unless others are named, nearest last."""
         if maker.name in above:
             raise UsageError(f"estimators serve one another in a circle: {' → '.join((*above, maker.name))}")
-        found: list[_Maker] = []
+        stages: list[_Maker] = []
         for need in maker.estimator.inputs:
             if need.stage:
                 stage = _Maker(need.stage, self.params)
-                found += [*self.default_stages(stage, (*above, maker.name)), stage]
-        return found
+                stages += [*self.default_stages(stage, (*above, maker.name)), stage]
+        return stages
 
     def add_chain(self, chain: Sequence[_Maker]) -> None:
         """Plan the runs of a chain."""
@@ -342,7 +342,7 @@ class _Planner:
             )
         by_kind = {c.kind: c for c in reversed(list(calibrations.values()))}
         return Context(
-            {name: tuple(found) for name, found in infos.items()},
+            {name: tuple(channels) for name, channels in infos.items()},
             self.source.metadata,
             self.source.attachments,
             self.source.static,
@@ -374,24 +374,24 @@ class _Maker:
             self.cls, own, self._name = type(asked), {}, None
         self._instance = None if isinstance(asked, EstimatorSpec | type) else asked
         fields: tuple[str, ...] = getattr(getattr(self.cls, "Params", None), "__struct_fields__", ())
-        known = {*fields, *(("preset",) if getattr(self.cls, "presets", None) and self._name else ())}
-        self.shared = {} if self._instance is not None else {k: v for k, v in params.items() if k in known}
+        names = {*fields, *(("preset",) if getattr(self.cls, "presets", None) and self._name else ())}
+        self.shared = {} if self._instance is not None else {k: v for k, v in params.items() if k in names}
         self._given = self.shared | own
         self._rated = "rate_hz" in fields
         self.estimator = self._make(self._given)
         self.name = self._name or getattr(self.estimator, "name", "") or self.cls.__name__
         self.version = _version(self.cls)
 
-    def _make(self, given: Mapping[str, Any]) -> Any:
+    def _make(self, params: Mapping[str, Any]) -> Any:
         if self._instance is not None:
             return copy.deepcopy(self._instance)
         cls: Any = self.cls
         try:
             if self._name is not None:
-                return make(self._name, **given)
-            if not given:
+                return make(self._name, **params)
+            if not params:
                 return cls()
-            return cls(msgspec.convert(dict(given), cls.Params))
+            return cls(msgspec.convert(dict(params), cls.Params))
         except (AlgorithmError, msgspec.ValidationError) as error:
             raise UsageError(str(error)) from None
 

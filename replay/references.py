@@ -64,9 +64,9 @@ def reference_of(
     """
     fitting = references(channels, kind)
     if chosen is not None:
-        known = [t for t in channels if t.startswith(PREFIX)]
-        if chosen not in known:
-            raise UsageError(f"{name}: no reference {chosen}; there are {', '.join(known) or 'none'}")
+        topics = [t for t in channels if t.startswith(PREFIX)]
+        if chosen not in topics:
+            raise UsageError(f"{name}: no reference {chosen}; there are {', '.join(topics) or 'none'}")
         if chosen in fitting:
             return chosen
     parts = [p for p in input_topic.split("/") if p]
@@ -92,8 +92,8 @@ def track_reference(
 
     See :func:`reference_of`.
     """
-    found = (reference_of(channels, kind, input_topic, chosen, name) for kind in kinds)
-    return next((topic for topic in found if topic is not None), None)
+    topics = (reference_of(channels, kind, input_topic, chosen, name) for kind in kinds)
+    return next((topic for topic in topics if topic is not None), None)
 
 
 def shown_reference(

@@ -98,14 +98,14 @@ class RowFeed:
             values = by_columns(len(times), self.width)
             values[:, 1 + len(columns) :] = np.nan
             for i, column in enumerate(columns, 1):
-                values[:, i] = given = table[column].to_numpy()
-                finite &= np.isfinite(given)
+                values[:, i] = column_values = table[column].to_numpy()
+                finite &= np.isfinite(column_values)
         keep, dt_s, resets = self.guard.take(times, finite)
         if keep is not None:
-            times, logs, keys, given = times[keep], logs[keep], keys[keep], values
+            times, logs, keys, column_values = times[keep], logs[keep], keys[keep], values
             values = by_columns(len(times), self.width)
             for i in range(1, self.width):
-                values[:, i] = given[keep, i]
+                values[:, i] = column_values[keep, i]
         values[:, 0] = dt_s
         first = 1 + len(columns)
         for i, (other, names) in enumerate(self.inputs[1:], 1):
@@ -145,12 +145,12 @@ class RowFeed:
 
     def findings(self) -> list[Finding]:
         """Return what was not fed and what was uneven, one line a kind."""
-        found = self.guard.findings()
+        findings = self.guard.findings()
         for (other, _), count in zip(self.inputs[1:], self._state.superseded[1:], strict=True):
             if count:
                 detail = (
                     f"{other}: {count} messages were overtaken by a newer one before the next row of "
                     f"{self.guard.topic}"
                 )
-                found.append(Finding("superseded", count, None, detail))
-        return found
+                findings.append(Finding("superseded", count, None, detail))
+        return findings

@@ -103,7 +103,7 @@ class Runner:
 
     # -- use -----------------------------------------------------------------------------------------
 
-    def take(self, given: Any) -> dict[str, Block]:
+    def take(self, block: Any) -> dict[str, Block]:
         """Feed what the feed gave; return a block of every output that has something to say."""
         raise NotImplementedError
 
@@ -177,7 +177,7 @@ class Runner:
 
     def findings(self) -> tuple[list[Finding], bool]:
         """Return what the user must know about the run, and whether its results must not be used."""
-        found = [*self.plan.findings, *self.feed.findings()]
+        findings = [*self.plan.findings, *self.feed.findings()]
         fatal = False
         if not self.samples:
             columns = " ".join(self.plan.inputs[0].columns)
@@ -185,12 +185,12 @@ class Runner:
                 f"{self.plan.input}: no message with a finite value in each of {columns} in the time "
                 "that was played: nothing was computed"
             )
-            found.append(Finding("no_samples", 1, None, detail))
+            findings.append(Finding("no_samples", 1, None, detail))
             fatal = True
         for remark in self.estimator.remarks() if hasattr(self.estimator, "remarks") else ():
-            found.append(Finding(remark.kind, 1, None, remark.detail))
+            findings.append(Finding(remark.kind, 1, None, remark.detail))
             fatal |= remark.fatal
-        return found, fatal
+        return findings, fatal
 
 
 class RowRunner(Runner):
@@ -213,16 +213,16 @@ class RowRunner(Runner):
         super().restore(snapshot[0])
         self._rows = list(snapshot[1])
 
-    def take(self, given: RowBlock) -> dict[str, Block]:
+    def take(self, block: RowBlock) -> dict[str, Block]:
         """Feed rows; return a block of every output that has something to say."""
         blocks: list[dict[str, Block]] = []
-        bounds = [0, *given.resets, len(given)]
+        bounds = [0, *block.resets, len(block)]
         for k, (a, b) in enumerate(pairwise(bounds)):
             if k and self._state.samples:
-                blocks.append(self._restart(int(given.keys[a])))
+                blocks.append(self._restart(int(block.keys[a])))
             if b > a:
                 blocks.append(
-                    self._segment(given.values[a:b], given.t_ns[a:b], given.t_log_ns[a:b], given.keys[a:b])
+                    self._segment(block.values[a:b], block.t_ns[a:b], block.t_log_ns[a:b], block.keys[a:b])
                 )
         return joined_by_name(blocks)
 
@@ -238,9 +238,9 @@ class RowRunner(Runner):
         columns = self._results(values).T
         times = t_ns
         if self.latency:
-            known = np.concatenate((state.recent_ns, t_ns))
-            state.recent_ns = known[-self.latency :]
-            early = self.latency - (len(known) - len(t_ns))  # rows whose result would speak of none
+            all_ns = np.concatenate((state.recent_ns, t_ns))
+            state.recent_ns = all_ns[-self.latency :]
+            early = self.latency - (len(all_ns) - len(t_ns))  # rows whose result would speak of none
             if early > 0:
                 if not np.isnan(columns[:, :early]).all():
                     raise MarchaError(
@@ -248,7 +248,7 @@ class RowRunner(Runner):
                         f"its declared latency: the result would have no time"
                     )
                 columns, t_log_ns, keys = columns[:, early:], t_log_ns[early:], keys[early:]
-            times = known[: len(known) - self.latency] if len(known) > self.latency else known[:0]
+            times = all_ns[: len(all_ns) - self.latency] if len(all_ns) > self.latency else all_ns[:0]
             times = times[len(times) - columns.shape[1] :]
         return self._by_output(columns, times, t_log_ns, keys)
 
@@ -305,42 +305,42 @@ class MessageRunner(Runner):
         self.kernel = isinstance(plan.estimator, KernelEstimator)
         super().__init__(plan, feed, blocks and self.kernel)
 
-    def take(self, given: MessageBlock) -> dict[str, Block]:
+    def take(self, block: MessageBlock) -> dict[str, Block]:
         """Feed messages; return a block of every output that has something to say."""
         blocks: list[dict[str, Block]] = []
-        messages = None if self.kernel else given.messages()
-        values = self._encoded(given) if self.kernel else None
-        for k, (a, b) in enumerate(pairwise([0, *given.resets, len(given)])):
+        messages = None if self.kernel else block.messages()
+        values = self._encoded(block) if self.kernel else None
+        for k, (a, b) in enumerate(pairwise([0, *block.resets, len(block)])):
             if k and self._state.samples:
-                blocks.append(self._restart(int(given.keys[min(a, len(given) - 1)])))
+                blocks.append(self._restart(int(block.keys[min(a, len(block) - 1)])))
             if b == a:
                 continue
             self._state.samples += b - a
-            self._state.last_log_ns = int(given.t_log_ns[b - 1])
+            self._state.last_log_ns = int(block.t_log_ns[b - 1])
             if messages is not None:
                 for first in range(a, b, _MESSAGES_A_TURN):
                     last = min(first + _MESSAGES_A_TURN, b)
-                    logs, keys = given.t_log_ns[first:last], given.keys[first:last]
+                    logs, keys = block.t_log_ns[first:last], block.keys[first:last]
                     blocks.append(self._one_by_one(islice(messages, last - first), logs, keys))
             else:
                 assert values is not None
-                blocks.append(self._through_kernel(given, values, a, b))
+                blocks.append(self._through_kernel(block, values, a, b))
         return joined_by_name(blocks)
 
-    def _encoded(self, given: MessageBlock) -> FloatArray:
+    def _encoded(self, block: MessageBlock) -> FloatArray:
         """Return the values of all messages as the kernel takes them."""
         encoded = [
             (p.places, self.estimator.encode(p.channel.index, p.channel.number, p.table))
-            for p in given.pieces
+            for p in block.pieces
         ]
         width = max((len(c.columns) for c in self.feed.channels), default=0)
-        values = np.full((len(given), max(1, width, *(e.shape[1] for _, e in encoded))), np.nan)
+        values = np.full((len(block), max(1, width, *(e.shape[1] for _, e in encoded))), np.nan)
         for places, numbers in encoded:
             values[places, : numbers.shape[1]] = numbers
         return values
 
     def _through_kernel(
-        self, given: MessageBlock, values: FloatArray, first: int, last: int
+        self, block: MessageBlock, values: FloatArray, first: int, last: int
     ) -> dict[str, Block]:
         estimator: KernelEstimator = self.estimator
         step = _MESSAGES_A_CALL if self.blocks else 1
@@ -356,9 +356,9 @@ class MessageRunner(Runner):
             n = int(
                 estimator.run(
                     estimator.state,
-                    given.inputs[a:b],
-                    given.channels[a:b],
-                    given.t_ns[a:b],
+                    block.inputs[a:b],
+                    block.channels[a:b],
+                    block.t_ns[a:b],
                     values[a:b],
                     message,
                     t_ns,
@@ -374,25 +374,25 @@ class MessageRunner(Runner):
             return {}
         cause = np.concatenate(whose)
         columns = np.ascontiguousarray(np.concatenate(rows).T)
-        return self._by_output(columns, np.concatenate(times), given.t_log_ns[cause], given.keys[cause])
+        return self._by_output(columns, np.concatenate(times), block.t_log_ns[cause], block.keys[cause])
 
     def _one_by_one(self, messages: Iterable[Message], logs: IntArray, keys: IntArray) -> dict[str, Block]:
         whose: list[int] = []
-        found: list[Result] = []
+        answers: list[Result] = []
         take = self.estimator.take
         begin = time.perf_counter()
         for i, message in enumerate(messages):
             results = take(message)
             if results:
                 if type(results) is Result:
-                    found.append(results)
+                    answers.append(results)
                     whose.append(i)
                 else:
                     for result in results:
-                        found.append(result)
+                        answers.append(result)
                         whose.append(i)
         self.loop_s += time.perf_counter() - begin
-        return self._blocks_of(found, whose, logs, keys)
+        return self._blocks_of(answers, whose, logs, keys)
 
     def _held_back(self, key: int) -> dict[str, Block]:
         state = self._state
@@ -406,17 +406,17 @@ class MessageRunner(Runner):
             columns = np.ascontiguousarray(values.T)
             return self._by_output(columns, t_ns, np.full(n, state.last_log_ns), np.full(n, key)) if n else {}
         held: Iterable[Result] = self.estimator.finish() or ()
-        found = list(held)
+        answers = list(held)
         self.loop_s += time.perf_counter() - begin
-        return self._blocks_of(found, [0] * len(found), np.array([state.last_log_ns]), np.array([key]))
+        return self._blocks_of(answers, [0] * len(answers), np.array([state.last_log_ns]), np.array([key]))
 
     def _blocks_of(
-        self, found: list[Result], whose: list[int], logs: IntArray, keys: IntArray
+        self, answers: list[Result], whose: list[int], logs: IntArray, keys: IntArray
     ) -> dict[str, Block]:
         """Return single results as one block an output; ``whose[k]`` is the message that caused result k."""
-        if not found:
+        if not answers:
             return {}
-        names, times, rows = zip(*found, strict=True)
+        names, times, rows = zip(*answers, strict=True)
         cause, t_ns = np.array(whose), np.array(times, np.int64)
         places: dict[str, IntArray] = {}
         if len(different := dict.fromkeys(names)) > 1:
@@ -430,8 +430,8 @@ class MessageRunner(Runner):
                 raise MarchaError(
                     f"estimator {self.plan.name} gave a result for {name!r}; it declares {', '.join(self.outputs)}"
                 )
-            at = places.get(name)
-            mine = rows if at is None else [rows[k] for k in at.tolist()]
+            chosen = places.get(name)
+            mine = rows if chosen is None else [rows[k] for k in chosen.tolist()]
             width = len(output.columns)
             if set(map(len, mine)) != {width}:
                 bad = next(r for r in mine if len(r) != width)
@@ -439,7 +439,7 @@ class MessageRunner(Runner):
                     f"estimator {self.plan.name}: a result of {name!r} has {len(bad)} values, "
                     f"its output has {width} columns: {', '.join(output.columns)}"
                 )
-            caused, when = (cause, t_ns) if at is None else (cause[at], t_ns[at])
+            caused, when = (cause, t_ns) if chosen is None else (cause[chosen], t_ns[chosen])
             data: Columns = {"t_ns": when, "t_log_ns": logs[caused]}
             for column, values in zip(output.columns, zip(*mine, strict=True), strict=True):
                 data[column] = np.array(values)

@@ -169,9 +169,9 @@ def stepwise(track: Trajectory, steps: pl.DataFrame, first_ns: int | None, last_
     times, places = [t, start[rests]], [place, place[before[rests]]]
     if start[0] < t[0] <= steps["end_ns"][0]:
         length, heading = steps["length_m"][0], steps["heading_rad"][0]
-        at = place[0] - length * np.array([np.cos(heading), np.sin(heading), 0.0])
+        origin = place[0] - length * np.array([np.cos(heading), np.sin(heading), 0.0])
         times.append(start[:1])
-        places.append(at[None])
+        places.append(origin[None])
     t, index = np.unique(np.concatenate(times), return_index=True)
     place = np.concatenate(places)[index]
     if last_ns is not None and last_ns + REST_NS > t[-1]:

@@ -163,15 +163,17 @@ def tune(
 def _check(spec: EstimatorSpec, values: Mapping[str, Values]) -> None:
     """Refuse a search that cannot work before anything is replayed."""
     try:
-        known = {p.name: p for p in describe(find(spec.name).Params)}
+        parameters = {p.name: p for p in describe(find(spec.name).Params)}
         make(spec.name, **spec.params)
     except AlgorithmError as error:
         raise UsageError(str(error)) from None
     if not values:
         raise UsageError("tune: no parameter to search; give at least one, for example c3_max=0.3:1.0")
     for name, choices in values.items():
-        if name not in known:
-            raise UsageError(f"{spec.name} has no parameter {name!r}; it has: {', '.join(sorted(known))}")
+        if name not in parameters:
+            raise UsageError(
+                f"{spec.name} has no parameter {name!r}; it has: {', '.join(sorted(parameters))}"
+            )
         if name in spec.params:
             raise UsageError(f"tune: {name} is both held (in the brackets) and searched; give it once")
         if not choices or len(set(choices)) != len(choices):
@@ -231,15 +233,15 @@ class _Objective:
                 self.tried[point] = _mean([])
         if not usable:
             return
-        found: dict[tuple[Any, ...] | None, list[dict[str, float] | None]] = {p: [] for p in usable}
+        figures: dict[tuple[Any, ...] | None, list[dict[str, float] | None]] = {p: [] for p in usable}
         specs = [EstimatorSpec(self.spec.name, self.params(p), f"p{i}") for i, p in enumerate(usable)]
         for rec, truth in zip(self.walks, self.truths, strict=True):
             runs = replay_recording(rec, specs, inputs=self.inputs, metrics=False).runs
             each = len(runs) // len(usable)  # one run an input, in the order of the estimators
             for i, point in enumerate(usable):
-                found[point] += [_figures(rec, run, truth) for run in runs[i * each : (i + 1) * each]]
+                figures[point] += [_figures(rec, run, truth) for run in runs[i * each : (i + 1) * each]]
         for point in usable:
-            self.tried[point] = _mean(found[point])
+            self.tried[point] = _mean(figures[point])
 
 
 def _figures(rec: Recording, run: Run, truth: Truth) -> dict[str, float] | None:
@@ -247,11 +249,11 @@ def _figures(rec: Recording, run: Run, truth: Truth) -> dict[str, float] | None:
     if run.fatal:
         return None
     view = replace(recording_view(rec, run.lineage, run.tables), truth=truth)
-    found = closure(view) | distance(view)
-    if "distance_error_percent" not in found:
+    figures = closure(view) | distance(view)
+    if "distance_error_percent" not in figures:
         return None
-    kept = {k: found[k] for k in ("closure_percent", "distance_error_percent", "steps") if k in found}
-    total = found.get("closure_percent", 0.0) + found["distance_error_percent"]
+    kept = {k: figures[k] for k in ("closure_percent", "distance_error_percent", "steps") if k in figures}
+    total = figures.get("closure_percent", 0.0) + figures["distance_error_percent"]
     return kept | {"objective": total}
 
 

@@ -193,8 +193,10 @@ class RunView:
     @property
     def inputs(self) -> dict[str, tuple[str, ...]]:
         """Topics by the name of the run's input."""
-        found = json.loads(self.lineage.get("inputs", "{}"))
-        return {name: tuple(topics) for name, topics in found.items()} if isinstance(found, dict) else {}
+        topics_of = json.loads(self.lineage.get("inputs", "{}"))
+        return (
+            {name: tuple(topics) for name, topics in topics_of.items()} if isinstance(topics_of, dict) else {}
+        )
 
     @property
     def output_schemas(self) -> dict[str, str]:
@@ -230,8 +232,8 @@ class RunView:
         """Return all references of a kind within the interval, by topic (one a segment, say)."""
         if self.recording is None:
             return {}
-        found = {t: self.raw(t) for t in references(self.recording.channels, kind)}
-        return {t: table for t, table in found.items() if table is not None}
+        tables = {t: self.raw(t) for t in references(self.recording.channels, kind)}
+        return {t: table for t, table in tables.items() if table is not None}
 
     @property
     def annotations(self) -> pl.DataFrame:
@@ -278,8 +280,8 @@ class RunView:
         if self.whole is not None and self.whole.stream is not None and self.spans is not None:
             whole = self.whole.track
             return None if whole is None else whole.within(self.spans)
-        if self.stream is not None and (found := self.stream("pose")) is not None:
-            track = track_of_stream(*found, bool(headings))
+        if self.stream is not None and (arrays := self.stream("pose")) is not None:
+            track = track_of_stream(*arrays, bool(headings))
             if track is not None:
                 return track
         track = track_of(self.table("pose", (*POSITION, *headings)))
@@ -298,8 +300,8 @@ class RunView:
     def compared(self, alignment: str) -> Comparison | None:
         """Return the estimate beside the reference under an alignment of the whole walk."""
         if self.whole is not None:
-            found = self.whole.compared(alignment)
-            return None if found is None or self.spans is None else found.within(self.spans)
+            comparison = self.whole.compared(alignment)
+            return None if comparison is None or self.spans is None else comparison.within(self.spans)
         if alignment not in self._comparisons:
             self._comparisons[alignment] = compare(self, alignment)
         return self._comparisons[alignment]
@@ -307,8 +309,8 @@ class RunView:
     @cached_property
     def stances(self) -> IntArray:
         """Stances as ``[first still, last still]`` times, shape (n, 2)."""
-        if self.whole is None and self.stream is not None and (found := self.stream("stance")) is not None:
-            return stances_of(found[1])
+        if self.whole is None and self.stream is not None and (arrays := self.stream("stance")) is not None:
+            return stances_of(arrays[1])
         table = self.table("stance")
         return stances_of(iter(() if table is None else (table,)))
 
@@ -328,14 +330,14 @@ def compare(view: RunView, alignment: str) -> Comparison | None:
     if sparse and is_sparse(track, max_gap_s) and (steps := view.table("step")) is not None:
         track, max_gap_s = stepwise(track, steps, *view.input_span), np.inf
     kept, other = (reference, track) if sparse else (track, reference)
-    found = match(kept.t_ns, other.t_ns, max_gap_s)
-    if not len(found.index):
+    pairs = match(kept.t_ns, other.t_ns, max_gap_s)
+    if not len(pairs.index):
         return None
-    here, there = kept.position[found.index], found.linear(other.position)
+    here, there = kept.position[pairs.index], pairs.linear(other.position)
     yaw_error = None
     yaws: tuple[FloatArray, FloatArray] | None = None
     if kept.yaw is not None and other.yaw is not None:
-        pair = (kept.yaw[found.index], found.angle(other.yaw))
+        pair = (kept.yaw[pairs.index], pairs.angle(other.yaw))
         yaws = (pair[1], pair[0]) if sparse else pair
     estimate, truth = (there, here) if sparse else (here, there)
     start = (float(yaws[0][0]), float(yaws[1][0])) if yaws is not None else (None, None)
@@ -343,13 +345,13 @@ def compare(view: RunView, alignment: str) -> Comparison | None:
     if yaws is not None:
         yaw_error = wrap(yaws[0] + transform.yaw - yaws[1])
     return Comparison(
-        kept.t_ns[found.index],
+        kept.t_ns[pairs.index],
         transform.points(estimate),
         truth,
         yaw_error,
         transform,
-        found,
+        pairs,
         not sparse,
         float(yaw_error[0]) if yaw_error is not None else 0.0,
-        np.delete(kept.t_ns, found.index),
+        np.delete(kept.t_ns, pairs.index),
     )

@@ -83,16 +83,16 @@ def failures(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     """
     of = factors(config)
     reason = pl.col("error").str.split(";").list.first().str.slice(0, 60)
-    found = table.group_by(of, maintain_order=True).agg(
+    failed = table.group_by(of, maintain_order=True).agg(
         cells=pl.len(),
         failed=(pl.col("status") != "ok").sum(),
         reasons=reason.filter(pl.col("status") != "ok").value_counts(sort=True),
     )
-    found = found.filter(pl.col("failed") > 0).with_columns(share=pl.col("failed") / pl.col("cells"))
+    failed = failed.filter(pl.col("failed") > 0).with_columns(share=pl.col("failed") / pl.col("cells"))
     texts = [
-        "; ".join(f"{r['error']} ({r['count']}×)" for r in reasons) for reasons in found["reasons"].to_list()
+        "; ".join(f"{r['error']} ({r['count']}×)" for r in reasons) for reasons in failed["reasons"].to_list()
     ]
-    return found.select(*of, "cells", "failed", "share").with_columns(
+    return failed.select(*of, "cells", "failed", "share").with_columns(
         reasons=pl.Series("reasons", texts, pl.String)
     )
 
@@ -252,11 +252,11 @@ def beside_published(group_table: pl.DataFrame, config: cfg.StudyConfig) -> pl.D
             if table.by != "estimator":
                 levels[table.by] = row_label
             for configuration, value in cells.items():
-                found = measured.get((table.metric, label, *levels.values(), configuration))
+                measured_row = measured.get((table.metric, label, *levels.values(), configuration))
                 more = {
                     f"published_{name}": None
-                    if (known := part.get(row_label, {}).get(configuration)) is None
-                    else known * table.scale
+                    if (published_value := part.get(row_label, {}).get(configuration)) is None
+                    else published_value * table.scale
                     for name, part in (("sd", table.sd), ("max", table.maximum), ("min", table.minimum))
                 }
                 published = value * table.scale
@@ -271,12 +271,12 @@ def beside_published(group_table: pl.DataFrame, config: cfg.StudyConfig) -> pl.D
                         "configuration": configuration,
                         "published": published,
                         **more,
-                        "measured": found["mean"] if found else None,
-                        "measured_sd": found["sd"] if found else None,
-                        "measured_max": found["maximum"] if found else None,
-                        "measured_min": found["minimum"] if found else None,
-                        "n": found["n"] if found else 0,
-                        "ratio": found["mean"] / published if found and published else None,
+                        "measured": measured_row["mean"] if measured_row else None,
+                        "measured_sd": measured_row["sd"] if measured_row else None,
+                        "measured_max": measured_row["maximum"] if measured_row else None,
+                        "measured_min": measured_row["minimum"] if measured_row else None,
+                        "n": measured_row["n"] if measured_row else 0,
+                        "ratio": measured_row["mean"] / published if measured_row and published else None,
                         "origin": table.origin,
                         "note": table.note,
                     }
@@ -316,9 +316,9 @@ def consistency(table: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     for name, dof in NEES.items():
         if name not in done.columns:
             continue
-        known = done.filter(pl.col(name).is_finite())
+        finite = done.filter(pl.col(name).is_finite())
         for by in (("clipped", "filter", *cfg.factor_names(config)), ("clipped", *factors(config))):
-            for key, part in known.group_by(*by, maintain_order=True):
+            for key, part in finite.group_by(*by, maintain_order=True):
                 mean, n = float(part[name].mean()), part.height  # pyright: ignore[reportArgumentType]
                 low, high = nees_bounds(n, dof, config.statistics.confidence)
                 verdict = (

@@ -259,8 +259,8 @@ def _run(rec: Recording, task: StudyTask, jobs: Sequence[Job], topics: list[str]
 def _by_label(rec: Recording, tier: str) -> dict[str, dict[str, dict[str, float]]]:
     """Return every run's metrics by the labels of a tier; none where there is neither tier nor rule."""
     marks = rec.annotations
-    known = (marks["tier"] == tier) | marks["tier"].str.ends_with(f"/{tier}")
-    if tier in RULES and not known.any():
+    of_tier = (marks["tier"] == tier) | marks["tier"].str.ends_with(f"/{tier}")
+    if tier in RULES and not of_tier.any():
         marks = pl.concat([marks, by_rules(rec, [tier], Selection()).select(marks.columns)])
     try:
         runs = evaluate(rec, intervals=False, by=tier, annotations=marks).runs

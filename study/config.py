@@ -470,8 +470,8 @@ def _grid(config: StudyConfig) -> Iterator[Method]:
                 ]
             )
             for chosen in itertools.product(*levels.values()):
-                at = dict(zip(levels, map(str, chosen), strict=True))
-                yield Method(entry.name, label, at, preset, params)
+                setting = dict(zip(levels, map(str, chosen), strict=True))
+                yield Method(entry.name, label, setting, preset, params)
 
 
 def _choice(config: StudyConfig, estimator: str, name: str, level: str) -> dict[str, Any]:

@@ -62,8 +62,8 @@ def colour(index: int) -> str:
 
 def _samples(frame: pl.DataFrame, factor: str, levels: Sequence[str]) -> dict[str, np.ndarray]:
     good = frame.filter(~pl.col("outlier") & pl.col("value").is_finite())
-    found = {level: good.filter(pl.col(factor) == level)["value"].to_numpy() for level in levels}
-    return {level: values for level, values in found.items() if len(values)}
+    samples = {level: good.filter(pl.col(factor) == level)["value"].to_numpy() for level in levels}
+    return {level: values for level, values in samples.items() if len(values)}
 
 
 def _box(
@@ -295,16 +295,16 @@ def level_boxes(frame: pl.DataFrame, config: cfg.StudyConfig, factor: str) -> Fi
 
 def level_tracks(cells: Sequence[StudyCell], config: cfg.StudyConfig, factor: str) -> Figure | None:
     """Overlaid tracks of one filter, a row a configuration, a column a level of ``factor`` (figure 35)."""
-    known = [c for c in cells if c.status == "ok" and len(c.positions) > 1]
-    if not known:
+    drawn = [c for c in cells if c.status == "ok" and len(c.positions) > 1]
+    if not drawn:
         return None
     names = dict.fromkeys(m.levels[factor] for m in cfg.methods(config))
-    names = [n for n in names if any(c.levels[factor] == n for c in known)]
-    rows = sorted({c.configuration for c in known})
+    names = [n for n in names if any(c.levels[factor] == n for c in drawn)]
+    rows = sorted({c.configuration for c in drawn})
     figure = Figure(figsize=(0.8 + 3.2 * len(names), 0.9 + 3.2 * len(rows)))
     axes = figure.subplots(len(rows), len(names), squeeze=False)
     for i, row in enumerate(rows):
-        own = [c for c in known if c.configuration == row]
+        own = [c for c in drawn if c.configuration == row]
         middle, reach = _frame(own)  # a walk of 300 m needs another frame than one of 10 m
         for k, name in enumerate(names):
             ax = axes[i, k]
@@ -316,7 +316,7 @@ def level_tracks(cells: Sequence[StudyCell], config: cfg.StudyConfig, factor: st
                 ax.set_ylabel(f"{row}\ny (m)")
             if i == len(rows) - 1:
                 ax.set_xlabel("x (m)")
-    figure.suptitle(f"{known[0].label}: tracks from above by {factor}")
+    figure.suptitle(f"{drawn[0].label}: tracks from above by {factor}")
     return figure
 
 
@@ -338,14 +338,14 @@ def by_walk(cells: Sequence[StudyCell], config: cfg.StudyConfig, column: str, un
     ``column`` is a metric with a signed ``<name>_difference…`` beside it (phone dissertation, figures 4.10, 4.11).
     """
     difference = column.replace("_m", "_difference_m") if column.endswith("_m") else f"{column}_difference"
-    known = [c for c in cells if c.status == "ok" and {column, difference} <= set(c.metrics)]
-    if not known:
+    measured = [c for c in cells if c.status == "ok" and {column, difference} <= set(c.metrics)]
+    if not measured:
         return None
-    configurations = list(dict.fromkeys(c.configuration for c in known))
+    configurations = list(dict.fromkeys(c.configuration for c in measured))
     figure = Figure(figsize=(1.2 + 3.6 * len(configurations), 4.6))
     axes = figure.subplots(2, len(configurations), squeeze=False, sharex="col", height_ratios=(2, 1))
     for k, configuration in enumerate(configurations):
-        own = [c for c in known if c.configuration == configuration]
+        own = [c for c in measured if c.configuration == configuration]
         x = np.arange(1, len(own) + 1)
         value = np.array([c.metrics[column] for c in own])
         error = np.array([c.metrics[difference] for c in own])
@@ -361,16 +361,16 @@ def by_walk(cells: Sequence[StudyCell], config: cfg.StudyConfig, column: str, un
             above.set_ylabel(unit)
             below.set_ylabel(f"error ({unit})")
             above.legend(fontsize=8, loc="lower right")
-    figure.suptitle(f"{column.removesuffix('_m').replace('_', ' ')} by walk, {known[0].label}")
+    figure.suptitle(f"{column.removesuffix('_m').replace('_', ' ')} by walk, {measured[0].label}")
     return figure
 
 
 def walk_panels(cells: Sequence[StudyCell], config: cfg.StudyConfig) -> Figure | None:
     """Six tracks a panel, in the order of the walks; a row a configuration, one filter."""
-    known = [c for c in cells if c.status == "ok" and len(c.positions) > 1]
+    drawn = [c for c in cells if c.status == "ok" and len(c.positions) > 1]
     rows = {
-        name: [c for c in known if c.configuration == name]
-        for name in dict.fromkeys(c.configuration for c in known)
+        name: [c for c in drawn if c.configuration == name]
+        for name in dict.fromkeys(c.configuration for c in drawn)
     }
     wide = max((-(-len(own) // WALKS_A_PANEL) for own in rows.values()), default=0)
     if not wide:
@@ -395,7 +395,7 @@ def walk_panels(cells: Sequence[StudyCell], config: cfg.StudyConfig) -> Figure |
                 ax.set_ylabel("y (m)")
             if i == len(rows) - 1:
                 ax.set_xlabel("x (m)")
-    figure.suptitle(f"Tracks walk by walk, {known[0].label}")
+    figure.suptitle(f"Tracks walk by walk, {drawn[0].label}")
     return figure
 
 

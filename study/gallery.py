@@ -120,11 +120,11 @@ def _levels(frame: pl.DataFrame, cells: Sequence[StudyCell], config: cfg.StudyCo
             if c.label == label and c.levels[factor] in levels and c.configuration in configurations
         ]
         stem = re.sub(r"[^a-z0-9]+", "-", f"{factor}-{label}".lower()).strip("-")
-        at = f"{label}, {', '.join(sorted(configurations))}"
-        caption = f"{at}: every metric by {factor} (mean: diamond; below 20 values every value)."
+        where = f"{label}, {', '.join(sorted(configurations))}"
+        caption = f"{where}: every metric by {factor} (mean: diamond; below 20 values every value)."
         drawn.append(Drawing(f"levels-{stem}", "box", caption, "level_boxes", (part, config, factor)))
         if config.tracks and own:
-            caption = f"{at}: tracks by {factor}, start at the cross, dots where they end."
+            caption = f"{where}: tracks by {factor}, start at the cross, dots where they end."
             drawn.append(
                 Drawing(f"level-tracks-{stem}", "tracks", caption, "level_tracks", (own, config, factor))
             )

@@ -42,10 +42,10 @@ def _paired(
 ) -> list[Any]:
     """Compare the levels of ``column`` over the walks that have both."""
     wide = part.pivot(column, index=list(WALK), values="value")
-    found: list[PairedComparison] = []
+    comparisons: list[PairedComparison] = []
     for a, b in pairs:
         both = wide.select(a, b).drop_nulls()
-        found.append(
+        comparisons.append(
             paired(
                 both[a].to_numpy(),
                 both[b].to_numpy(),
@@ -53,10 +53,10 @@ def _paired(
                 min_samples=options.min_samples,
             )
         )
-    t, rank = holm([r.t_p for r in found]), holm([r.rank_p for r in found])
+    t, rank = holm([r.t_p for r in comparisons]), holm([r.rank_p for r in comparisons])
     return [
         msgspec.structs.replace(r, t_p_holm=float(p), rank_p_holm=float(q))
-        for r, p, q in zip(found, t, rank, strict=True)
+        for r, p, q in zip(comparisons, t, rank, strict=True)
     ]
 
 
@@ -170,7 +170,7 @@ def verdicts(frame: pl.DataFrame, pairs: pl.DataFrame, config: cfg.StudyConfig) 
     usable = _usable(frame)
     base = base_levels(order(usable, config), config)
     level = 1 - config.statistics.confidence
-    known = {v.metric: v.smallest for v in config.verdicts}
+    by_metric = {v.metric: v.smallest for v in config.verdicts}
     rows: list[dict[str, Any]] = []
     means = usable.filter(*at_base(base)).group_by("metric", "filter", "configuration", maintain_order=True)
     table = means.agg(mean=pl.col("value").mean(), n=pl.len()).filter(
@@ -188,7 +188,7 @@ def verdicts(frame: pl.DataFrame, pairs: pl.DataFrame, config: cfg.StudyConfig) 
             )
             if own == here and np.isfinite(r["p"]) and r["p"] >= level
         ]
-        published = sorted(known.get(str(metric), []))
+        published = sorted(by_metric.get(str(metric), []))
         ours = sorted([" ".join(here), *equal])
         rows.append(
             {
@@ -233,8 +233,8 @@ def relations(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
                 if configuration not in table.rows[b] or not table.rows[b][configuration]:
                     continue
                 walks = part.filter(pl.col("configuration") == configuration, pl.col(column).is_in([a, b]))
-                found = set(walks[column].to_list())
-                if found != {a, b}:
+                values = set(walks[column].to_list())
+                if values != {a, b}:
                     continue
                 wide = walks.pivot(column, index=list(WALK), values="value").drop_nulls()
                 x, y = wide[a].to_numpy(), wide[b].to_numpy()

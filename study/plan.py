@@ -160,8 +160,8 @@ def find_sources(
     sources: list[StudyRecording] = []
     notes: list[str] = []
     if config.recordings is not None:
-        found, notes = _files(config.recordings, data)
-        for name, path in found:
+        files, notes = _files(config.recordings, data)
+        for name, path in files:
             sources.append(_source(config.recordings, name, path, code))
     if config.simulate is not None:
         sources += _walks(config.simulate, code)
@@ -180,15 +180,15 @@ def _files(
         if not root.exists():
             raise UsageError(f"{root}: no such file or folder; give the folder of the recordings with --data")
         base = root if root.is_dir() else root.parent
-        found = sorted({p for g in recordings.files for p in root.glob(g)}) if root.is_dir() else [root]
-        if root.is_dir() and (left := _left_out(root, found)):
+        paths = sorted({p for g in recordings.files for p in root.glob(g)}) if root.is_dir() else [root]
+        if root.is_dir() and (left := _left_out(root, paths)):
             some = ", ".join(str(p.relative_to(root)) for p in left[:3])
             notes.append(
-                f"{len(left)} of {len(left) + len(found)} files in {root} do not match `files` "
+                f"{len(left)} of {len(left) + len(paths)} files in {root} do not match `files` "
                 f"({', '.join(recordings.files)}) and are left out: {some}{' …' if len(left) > 3 else ''}"
             )
         # The truth of a simulated walk stands beside its log and belongs to it.
-        for path in (p for p in found if p.is_file() and ".truth." not in p.name):
+        for path in (p for p in paths if p.is_file() and ".truth." not in p.name):
             name = str(path.relative_to(base).with_suffix("").as_posix())
             other = names.get(name)
             if other is None:
@@ -209,9 +209,9 @@ def _files(
     return sorted(names.items()), notes
 
 
-def _left_out(root: Path, found: Sequence[Path]) -> list[Path]:
+def _left_out(root: Path, paths: Sequence[Path]) -> list[Path]:
     """Return the files of a folder, and of those in it, that no pattern takes: hidden ones and truth apart."""
-    taken = set(found)
+    taken = set(paths)
     return [
         p
         for p in sorted(root.rglob("*"))
@@ -226,10 +226,10 @@ def _left_out(root: Path, found: Sequence[Path]) -> list[Path]:
 def _source(recordings: cfg.Recordings, name: str, path: Path, code: str) -> StudyRecording:
     raw = path.suffix != ".mcap"
     beside = sorted(path.parent.glob(f"{glob.escape(path.stem)}.truth.*")) if raw else []
-    known = (
+    facts = (
         cfg.TruthRule() if beside else cfg.truth(recordings, path.name)
     )  # what a walk knows of itself counts
-    truth = {k: v for k, v in (("closed", known.closed), ("length_m", known.length_m)) if v is not None}
+    truth = {k: v for k, v in (("closed", facts.closed), ("length_m", facts.length_m)) if v is not None}
     options = recordings.options if raw else {}
     content = [file_digest(p) for p in (path, *beside)]
     return StudyRecording(

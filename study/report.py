@@ -164,7 +164,7 @@ def _levels_of(label: str, base: dict[str, str], config: cfg.StudyConfig) -> tup
 def _means(html: Html, contents: ReportContents, levels: dict[str, list[str]]) -> None:
     html.section("Means by filter and configuration")
     base = base_levels(levels, contents.config)
-    found = _lookup(contents)
+    entries_of = _lookup(contents)
     levels_of = {name: _levels_of(name, base, contents.config) for name in levels["filter"]}
     shares = {
         (r["configuration"],): r["share"]
@@ -186,7 +186,7 @@ def _means(html: Html, contents: ReportContents, levels: dict[str, list[str]]) -
     )
     for metric in contents.config.metrics:
         title = cfg.metric_title(metric)
-        if not any(k[0] == title for k in found):
+        if not any(k[0] == title for k in entries_of):
             continue
         tables = [t for t in contents.config.published if t.metric == title and t.by == "estimator"]
         html.heading(f"{title} ({metric.unit})" if metric.unit else title)
@@ -194,13 +194,13 @@ def _means(html: Html, contents: ReportContents, levels: dict[str, list[str]]) -
         for name in levels["filter"]:
             row = [escape(name)]
             for c in levels["configuration"]:
-                group = found.get((title, name, *levels_of[name], c))
+                group = entries_of.get((title, name, *levels_of[name], c))
                 n = f' <span class="note">({group["n"]})</span>' if group else ""
                 row.append(mean_sd(group) + n)
-            rows.append([*row, mean_sd(found.get((title, name, *levels_of[name], "")))])
-            known = [beside.get((title, name, *levels_of[name], c)) for c in levels["configuration"]]
-            if any(v is not None for v in known):
-                cells = [f"@published {number(v, 4)}" for v in known]
+            rows.append([*row, mean_sd(entries_of.get((title, name, *levels_of[name], "")))])
+            published = [beside.get((title, name, *levels_of[name], c)) for c in levels["configuration"]]
+            if any(v is not None for v in published):
+                cells = [f"@published {number(v, 4)}" for v in published]
                 rows.append(["@published published", *cells, "@published "])
         html.table(["filter", *levels["configuration"], "all"], rows)
         for table in tables:
@@ -251,10 +251,10 @@ def _methods(html: Html, contents: ReportContents, levels: dict[str, list[str]])
     subsets = [s for s in ("unclipped", "clipped") if (contents.groups["subset"] == s).any()] or ["all"]
     rows: list[list[str]] = []
     for subset in subsets:
-        found = _lookup(contents, subset)
+        entries_of = _lookup(contents, subset)
         body: list[list[str]] = []
         for method in _combinations(contents, levels):
-            entries = [found.get((t, *method, "")) for t in titles]
+            entries = [entries_of.get((t, *method, "")) for t in titles]
             if any(entries):
                 n = max(e["n"] for e in entries if e)
                 body.append([*map(escape, method), *map(mean_sd, entries), str(n)])
@@ -302,14 +302,14 @@ def _consistency(html: Html, contents: ReportContents, pictures: Sequence[PagePi
                 continue
             shown = [c for c in levels["configuration"] if c and c in part["configuration"]]
             shown.append("")
-            found = {tuple(r[f] for f in of): r for r in part.iter_rows(named=True)}
+            rows_of = {tuple(r[f] for f in of): r for r in part.iter_rows(named=True)}
             rows.append([title])
             rows.append([*of[:-1], *(escape(c) or "all" for c in shown)])
             for method in _combinations(contents, levels):
-                entries = [found.get((*method, c)) for c in shown]
+                entries = [rows_of.get((*method, c)) for c in shown]
                 if any(entries):
                     rows.append([*map(escape, method), *map(_verdict, entries)])
-            limits = [next(r for r in found.values() if r["configuration"] == c) for c in shown]
+            limits = [next(r for r in rows_of.values() if r["configuration"] == c) for c in shown]
             rows.append(
                 [
                     "@note consistent within",
@@ -379,13 +379,13 @@ def _labels(html: Html, contents: ReportContents, levels: dict[str, list[str]]) 
     )
     means = label_means(contents.labels, contents.config)
     labels = sorted(means["label"].unique(), key=lambda label: (label == BETWEEN, label))
-    found = {(r["metric"], *(r[f] for f in of), r["label"]): r for r in means.iter_rows(named=True)}
+    entries_of = {(r["metric"], *(r[f] for f in of), r["label"]): r for r in means.iter_rows(named=True)}
     for (metric, unit), pairs in contents.label_comparisons.group_by("metric", "unit", maintain_order=True):
         html.heading(f"{metric} ({unit})" if unit else str(metric))
         methods = list(itertools.product(*(levels[f] for f in of)))
         rows = []
         for method in methods:
-            cells = [found.get((metric, *method, label)) for label in labels]
+            cells = [entries_of.get((metric, *method, label)) for label in labels]
             if any(cells):
                 values = [f"{mean_sd(c)} ({c['n']})" if c else "–" for c in cells]
                 rows.append([*(escape(m) for m in method), *values])

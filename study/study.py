@@ -306,9 +306,9 @@ def _mark(toml: str, code: str, cells: Sequence[StudyCell], notes: Sequence[str]
 
 def _is_rendered(folder: Path, mark: str) -> bool:
     """Whether the folder's report and tables were made of just this."""
-    known = folder / RENDERED
+    marker = folder / RENDERED
     there = all((folder / name).is_file() for name in ("report.html", "results.parquet", "results.csv"))
-    return there and known.is_file() and known.read_text(encoding="utf-8") == mark
+    return there and marker.is_file() and marker.read_text(encoding="utf-8") == mark
 
 
 def _plain(config: cfg.StudyConfig) -> Any:
@@ -324,16 +324,16 @@ def _plain(config: cfg.StudyConfig) -> Any:
 
 def _take_folder(folder: Path, toml: str, *, overwrite: bool, resume: bool) -> None:
     """Make the folder the study's own, or refuse."""
-    known = folder / "study.toml"
+    copy = folder / "study.toml"
     if folder.exists() and not folder.is_dir():
         raise OutputExists(folder)
     if folder.is_dir() and any(folder.iterdir()):
-        if not known.is_file():
+        if not copy.is_file():
             raise UsageError(f"{folder}: is not empty and holds no study; give another folder")
         if overwrite:
             for part in ("cells", "recordings", "figures"):
                 shutil.rmtree(folder / part, ignore_errors=True)
-        elif not resume and known.read_text(encoding="utf-8") != toml:
+        elif not resume and copy.read_text(encoding="utf-8") != toml:
             raise UsageError(
                 f"{folder}: holds a study with another configuration; give another folder, --resume to go on "
                 "with this one "
@@ -341,7 +341,7 @@ def _take_folder(folder: Path, toml: str, *, overwrite: bool, resume: bool) -> N
             )
     for part in (folder, folder / "cells", folder / "recordings", folder / "figures"):
         remove_left(part)
-    write_atomic(known, lambda path: path.write_text(toml, encoding="utf-8"))
+    write_atomic(copy, lambda path: path.write_text(toml, encoding="utf-8"))
 
 
 def _with_configuration(cell: StudyCell, source: plan.StudyRecording, config: cfg.StudyConfig) -> StudyCell:

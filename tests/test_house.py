@@ -147,3 +147,16 @@ def test_one_public_name_means_one_thing() -> None:
                 places.setdefault(node.name, []).append(module)
     del places["Params"]
     assert {name: where for name, where in places.items() if len(where) > 1} == {}
+
+
+VAGUE = {"found", "known", "given", "said", "at"}
+"""Names that say that there is a value and not what it is."""
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_variables_say_what_they_hold(path: Path) -> None:
+    public = {("viz/screenshot.py", "at")}  # screenshots(…, at=0.5): where on the time line
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        name = node.arg if isinstance(node, ast.arg) else node.id if isinstance(node, ast.Name) else ""
+        if (path.relative_to(ROOT).as_posix(), name) not in public:
+            assert name not in VAGUE, f"{path}:{getattr(node, 'lineno', 0)}: {name}"

@@ -45,7 +45,7 @@ def test_angles_of_landmarks_are_the_true_ones(sides: str, joints: list[str], de
         error = deg(found.angle[joint] - seen.angle[joint])
         assert np.sqrt(np.nanmean(error**2)) < 0.3
         assert abs(np.nanmean(error)) < 0.05
-        assert found.said[joint].startswith(definition)
+        assert found.remarks[joint].startswith(definition)
 
 
 def test_abduction_and_rotation_follow_grood_and_suntay() -> None:
@@ -95,7 +95,7 @@ def test_clusters_without_landmarks_give_the_turn_about_their_main_axis() -> Non
     assert np.mean(error) == pytest.approx(
         -np.degrees(seen.angle["knee"][:100].mean()), abs=0.3
     )  # zero at rest
-    assert found.said["knee"].startswith("functional")
+    assert found.remarks["knee"].startswith("functional")
     assert functional(seen.t, seen.rot_ns["thigh"], seen.rot_ns["thigh"], 1.0) is None
 
 

@@ -41,9 +41,9 @@ class _Lane:
         insort(self.starts, start)
         self.rows[start] = (end, label)
         for t in (start, end):
-            at = bisect_left(self.changes, t)
-            if at == len(self.changes) or self.changes[at] != t:
-                self.changes.insert(at, t)
+            index = bisect_left(self.changes, t)
+            if index == len(self.changes) or self.changes[index] != t:
+                self.changes.insert(index, t)
 
     def remove(self, start: int) -> None:
         self.starts.remove(start)
@@ -51,10 +51,10 @@ class _Lane:
 
     def state(self, t: int) -> str:
         """Return what is drawn from a time on: a label, or the empty state of a gap."""
-        at = bisect_right(self.starts, t) - 1
-        if at < 0:
+        index = bisect_right(self.starts, t) - 1
+        if index < 0:
             return ""
-        end, label = self.rows[self.starts[at]]
+        end, label = self.rows[self.starts[index]]
         return (label or "(no label)") if t < end else ""
 
 
@@ -140,10 +140,10 @@ class AnnotationLanes:
             if tier.rpartition("/")[0] not in self.canvas.runs:
                 text = f"{tier}: {row['label']}" + (f", {(end - start) / 1e9:.2f} s" if end > start else "")
                 lines.setdefault(tier, []).append((start, text))
-        for tier, found in lines.items():
+        for tier, entries in lines.items():
             path = f"{self.canvas.prefix}/log/annotation/{entity(tier)}"
-            found.sort(key=lambda line: line[0])
-            self.canvas.text(path, np.array([t for t, _ in found]), [text for _, text in found])
+            entries.sort(key=lambda line: line[0])
+            self.canvas.text(path, np.array([t for t, _ in entries]), [text for _, text in entries])
             self.canvas.show("log", path, tab=REPORT, panel="steps and annotations", owner=tier)
 
     def _tier(self, name: str) -> _Tier:
@@ -153,12 +153,12 @@ class AnnotationLanes:
         return self.tiers[name]
 
     def _lane(self, tier: _Tier, start: int, end: int) -> _Lane:
-        found = next((lane for lane in tier.lanes if lane.takes(start, end)), None)
-        if found is None:
+        free = next((lane for lane in tier.lanes if lane.takes(start, end)), None)
+        if free is None:
             level = len(tier.lanes)
-            found = _Lane(tier.path if level == 0 else f"{tier.path}/overlap{level + 1}")
-            tier.lanes.append(found)
-        return found
+            free = _Lane(tier.path if level == 0 else f"{tier.path}/overlap{level + 1}")
+            tier.lanes.append(free)
+        return free
 
     def _points(self, name: str, tier: _Tier) -> None:
         """Draw the instants of a tier anew, and hide those that were drawn before."""

@@ -126,22 +126,22 @@ def _panels(entries: Sequence[Entry], canvases: Sequence[Canvas]) -> list[Part]:
     panels: dict[tuple[str, str], list[Entry]] = {}
     for entry in entries:
         panels.setdefault((entry.kind, entry.panel), []).append(entry)
-    found: list[Part] = []
+    parts: list[Part] = []
     stacks: dict[str, list[Part]] = {}
     places: dict[str, int] = {}
     for own in panels.values():
         view, stack = _view(own, canvases), own[0].stack
         if not stack:
-            found.append(view)
+            parts.append(view)
             continue
         if stack not in stacks:
-            places[stack] = len(found)
-            found.append(view)
+            places[stack] = len(parts)
+            parts.append(view)
         stacks.setdefault(stack, []).append(view)
     for stack, views in stacks.items():
         if len(views) > 1:
-            found[places[stack]] = rrb.Tabs(*views, name=stack)
-    return found
+            parts[places[stack]] = rrb.Tabs(*views, name=stack)
+    return parts
 
 
 def _view(entries: Sequence[Entry], canvases: Sequence[Canvas]) -> Part:
@@ -230,8 +230,8 @@ def _past(
 def _space(panel: str, entries: Sequence[Entry], canvases: Sequence[Canvas]) -> Part:
     """Return the 3D view of a panel; where there is a floor plan, the tracks from above lie before it."""
     if panel != SPACE:
-        found = [c for canvas in canvases for c in canvas.solid.get(panel, [])]
-        corners = np.array(found or [np.full(3, -0.5), np.full(3, 0.5)], dtype=float)
+        points = [c for canvas in canvases for c in canvas.solid.get(panel, [])]
+        corners = np.array(points or [np.full(3, -0.5), np.full(3, 0.5)], dtype=float)
         return _solid(panel, entries, canvases, corners.min(axis=0), corners.max(axis=0), least=0.8)
     low, high = extent(canvases)
     solid = _solid(panel, entries, canvases, low, high)

@@ -251,11 +251,11 @@ class Canvas:
         schema, needs : str
             Message type, and a column that it must have.
         """
-        found = [
+        candidates = [
             c.topic for c in self.channels if c.schema == schema and needs in c.columns and is_raw(c.topic)
         ]
-        read = [t for t in found if any(t[1:].replace("/", "_") in run for run in self.runs)]
-        return next(iter(read or found), None)
+        read = [t for t in candidates if any(t[1:].replace("/", "_") in run for run in self.runs)]
+        return next(iter(read or candidates), None)
 
     # -- what is shown where
 
@@ -339,11 +339,11 @@ class Canvas:
     def limit(self, path: str, limit: Threshold, unit: str = "") -> None:
         """Log a horizontal line below an entity, over the whole time seen."""
         # two runs may limit one statistic differently
-        at = f"{path}/threshold/{entity(f'{limit.name}_{limit.value:g}')}"
+        entity_path = f"{path}/threshold/{entity(f'{limit.name}_{limit.value:g}')}"
         word = "min" if limit.name.endswith(".min") else "max"
-        self.lines(at, [f"{word} {limit.value:g}{unit}"], [style.THRESHOLD])
+        self.lines(entity_path, [f"{word} {limit.value:g}{unit}"], [style.THRESHOLD])
         span = self.span()
-        self.scalars(at, span, np.full(span.size, limit.value))
+        self.scalars(entity_path, span, np.full(span.size, limit.value))
 
     def span(self) -> Times:
         """Return first and last time seen, shape (2,), or nothing, shape (0,), before the first row."""

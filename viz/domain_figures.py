@@ -167,11 +167,11 @@ def fixes(rec: Recording, fig: Figure) -> None:
             continue
         place, color = table.select("lat_deg", "lon_deg").to_numpy(), _color(rec, topic)
         first = np.array(place[0] if first is None else first)
-        line, known = "-" if is_estimate(topic) else "", {"color": color, "label": _owner(topic)}
+        line, look = "-" if is_estimate(topic) else "", {"color": color, "label": _owner(topic)}
         scale = metres_a_degree(first[:1])[0]
-        degrees.plot(place[:, 1], place[:, 0], linestyle=line, marker=".", **known)
+        degrees.plot(place[:, 1], place[:, 0], linestyle=line, marker=".", **look)
         local = (place - first) * scale
-        metres.plot(local[:, 1], local[:, 0], linestyle=line, marker=".", **known)
+        metres.plot(local[:, 1], local[:, 0], linestyle=line, marker=".", **look)
         if "sd_east_m" in table.columns and not is_estimate(topic):
             sd = table.select("sd_east_m", "sd_north_m").to_numpy()
             for ring in (geo_circle(place, sd) - first) * scale:
@@ -186,7 +186,7 @@ def fixes(rec: Recording, fig: Figure) -> None:
 
 
 def _traces(rec: Recording) -> dict[str, Trace]:
-    found: dict[str, Trace] = {}
+    traces: dict[str, Trace] = {}
     for topic in _topics(rec, ["pos_x", "pos_y", "pos_z"], *PLACES):
         table = rec.table(topic)
         position = table.select(pl.col("pos_x", "pos_y"), pl.col("pos_z").fill_nan(0.0)).to_numpy()
@@ -194,8 +194,8 @@ def _traces(rec: Recording) -> dict[str, Trace]:
         trace = Trace(_owner(topic), _color(rec, topic))
         trace.add(table["t_ns"].to_numpy(), position, turn)
         if trace.count:
-            found[topic] = trace
-    return found
+            traces[topic] = trace
+    return traces
 
 
 def floor(rec: Recording, fig: Figure) -> None:
@@ -210,8 +210,10 @@ def floor(rec: Recording, fig: Figure) -> None:
     for line in plan.outlines:
         ax.plot(line[:, 0], line[:, 1], color="#777777", linewidth=1.0)
     for i, kind in enumerate(dict.fromkeys(a.technology for a in plan.anchors.values())):
-        at = np.array([a.position for a in plan.anchors.values() if a.technology == kind])
-        ax.plot(at[:, 0], at[:, 1], "s^vPX*"[i % 6], color="black", label=f"anchors {kind}".strip())
+        positions = np.array([a.position for a in plan.anchors.values() if a.technology == kind])
+        ax.plot(
+            positions[:, 0], positions[:, 1], "s^vPX*"[i % 6], color="black", label=f"anchors {kind}".strip()
+        )
     for topic, trace in traces.items():
         p = trace.positions
         mark = "o" if trace.sparse and is_estimate(topic) else ""
@@ -245,13 +247,13 @@ def radio(rec: Recording, fig: Figure) -> None:
     for i, mac in enumerate(macs):
         rows = table.filter(pl.col("mac") == mac)
         rssi, color = rows["rssi_dbm"].cast(pl.Float64).to_numpy(), style.run_color(i)
-        known = {"color": color, "label": printable(mac)}
-        axes[0].plot(_s(rec, rows), rssi, ".", markersize=3, **known)
-        axes[1].hist(rssi, bins=np.arange(-110.0, 0.0, 2.0), histtype="step", **known)
+        look = {"color": color, "label": printable(mac)}
+        axes[0].plot(_s(rec, rows), rssi, ".", markersize=3, **look)
+        axes[1].hist(rssi, bins=np.arange(-110.0, 0.0, 2.0), histtype="step", **look)
         anchor: Anchor | None = anchors.get(mac.lower())
         if beside and truth is not None and anchor is not None:
             gone = np.linalg.norm(truth.at(rows["t_ns"].to_numpy()) - anchor.position, axis=1)
-            axes[2].plot(gone, rssi, ".", markersize=3, **known)
+            axes[2].plot(gone, rssi, ".", markersize=3, **look)
             d = np.geomspace(0.5, max(float(gone.max()), 1.0), 60)
             axes[2].plot(d, anchor.p_d0 - 10 * anchor.eta * np.log10(d), color=color, linewidth=1.0)
     _dress(
@@ -270,25 +272,25 @@ def radio(rec: Recording, fig: Figure) -> None:
 def error(rec: Recording, fig: Figure) -> None:
     """Distance to the reference over time, and its distribution; positions as they are, not aligned."""
     traces = _traces(rec)
-    found = {}
+    results = {}
     for topic, trace in traces.items():
         truth = (
             shown_reference(rec.channels, topic.split("/")[2], rec.metadata) if is_estimate(topic) else None
         )
         result = compared(trace, traces[truth], "none") if truth in traces else None
         if result is not None:
-            found[topic] = result
-    _found(rec, "track with a reference", list(found))
+            results[topic] = result
+    _found(rec, "track with a reference", list(results))
     fig.set_size_inches(12.0, 4.5)
     over, share = fig.subplots(1, 2)
-    for topic, result in found.items():
+    for topic, result in results.items():
         far, color = distance(result), traces[topic].color
         over.plot((result.t_ns - (rec.start_ns or 0)) / 1e9, far, color=color, label=_owner(topic))
         ordered = np.sort(far)
-        at = 100.0 * np.arange(1, len(far) + 1) / len(far)
+        percent = 100.0 * np.arange(1, len(far) + 1) / len(far)
         median, p95 = np.percentile(far, [50, 95])
         name = f"{_owner(topic)}: mean {far.mean():.2f}, median {median:.2f}, 95 % {p95:.2f} m"
-        share.step(ordered, at, color=color, where="post", label=name)
+        share.step(ordered, percent, color=color, where="post", label=name)
     _dress(over, "error of the position (not aligned)", TIME, "m", legend=False)
     _dress(share, "distribution", "error (m)", "% of the samples")
 
@@ -352,18 +354,18 @@ def jumps(rec: Recording, fig: Figure) -> None:
 
 def cycles(rec: Recording, fig: Figure) -> None:
     """Joint angles over the gait cycle: mean and standard deviation of estimate and reference, every cycle's error."""
-    found = [
+    results = [
         (run.run, joint)
         for run in (evaluate(rec, intervals=False).runs if any(map(is_estimate, rec.channels)) else [])
         for joint in run.cycles
     ]
-    if not found:
+    if not results:
         raise UsageError(
             f"{rec.path}: nothing for this figure: no joint angle with a reference over two cycles"
         )
     percent = np.arange(101)
-    axes = _rows(fig, 2 * len(found))
-    for (run, joint), ax, below in zip(found, axes[::2], axes[1::2], strict=True):
+    axes = _rows(fig, 2 * len(results))
+    for (run, joint), ax, below in zip(results, axes[::2], axes[1::2], strict=True):
         color = _color(rec, f"/estimate/{run}/joint")
         curves = (
             (ax, joint.reference_mean, joint.reference_sd, style.REFERENCE, "reference"),

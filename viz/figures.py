@@ -205,26 +205,26 @@ def _walk(rec: Recording, alignment: str) -> _Walk:
     poses = [t for t, c in rec.channels.items() if c.schema == POSE]
     runs = [t for t in poses if t.startswith("/estimate/") and t.endswith("/pose")]
     truth = {t: _reference(rec, t.split("/")[2]) for t in runs}
-    found = {t: Trace(t.split("/")[2], style.run_color(i)) for i, t in enumerate(runs)}
+    traces = {t: Trace(t.split("/")[2], style.run_color(i)) for i, t in enumerate(runs)}
     for topic in truth.values() if runs else [_reference(rec, "")]:
         if topic is not None:
-            found[topic] = Trace(" ".join(topic.split("/")[1:-1]), style.REFERENCE)
-    for window in rec.windows(list(found)) if found else ():
+            traces[topic] = Trace(" ".join(topic.split("/")[1:-1]), style.REFERENCE)
+    for window in rec.windows(list(traces)) if traces else ():
         for topic, table in window.tables.items():
             position = table.select("pos_x", "pos_y", "pos_z").to_numpy()
             turn = table.select([f"quat_{a}" for a in "wxyz"]).to_numpy() if "quat_w" in table else None
-            found[topic].add(table["t_ns"].to_numpy(), position, turn)
-    found = {t: track for t, track in found.items() if track.count}
+            traces[topic].add(table["t_ns"].to_numpy(), position, turn)
+    traces = {t: track for t, track in traces.items() if track.count}
     found_errors: dict[str, Comparison] = {}
     for topic, reference in truth.items():
-        if topic in found and reference in found:
-            track = found[topic]
-            result = compared(track, found[reference], alignment)
+        if topic in traces and reference in traces:
+            track = traces[topic]
+            result = compared(track, traces[reference], alignment)
             if result is not None:
                 track.place, track.worst_m = result.transform, float(distance(result).max())
                 found_errors[track.owner] = result
-    tracks = {found[t].owner: found[t] for t in runs if t in found}
-    beside = {t: track for t, track in found.items() if t.startswith("/reference/")}
+    tracks = {traces[t].owner: traces[t] for t in runs if t in traces}
+    beside = {t: track for t, track in traces.items() if t.startswith("/reference/")}
     return _Walk(rec, tracks, beside, found_errors, alignment)
 
 
@@ -350,9 +350,9 @@ def _errors(ax: Axes, walk: _Walk) -> None:
     inside, top = framed(walk.shown), 0.0
     for run, track in walk.tracks.items():
         if run in walk.compared:
-            found = walk.compared[run]
-            far = distance(found)
-            t, d = _thin(walk.seconds(found.t_ns), far)
+            comparison = walk.compared[run]
+            far = distance(comparison)
+            t, d = _thin(walk.seconds(comparison.t_ns), far)
             ax.plot(t, d, color=track.color, linewidth=1.2)
             top = max(top, float(far.max())) if track in inside else top
         if topic := _position_sigma(walk.rec, run):

@@ -121,7 +121,7 @@ def tried(loaders: Loaders, name: str, read: Callable[[bytes], Any]) -> Any:
 
 
 def _anchors(data: bytes) -> dict[str, Anchor]:
-    found: dict[str, Anchor] = {}
+    anchors: dict[str, Anchor] = {}
     for row in csv.DictReader(io.StringIO(data.decode("utf-8-sig"))):
         row = {
             (k or "").strip().lower(): (v or "").strip() for k, v in row.items() if isinstance(v, str | None)
@@ -131,9 +131,11 @@ def _anchors(data: bytes) -> dict[str, Anchor]:
             raise ValueError(f"anchor {row.get('mac', '')!r} has no x and y")
         mac = row["mac"].lower()
         technology = printable(row.get("technology", ""))
-        known = np.nan_to_num(np.array(place))
-        found[mac] = Anchor(mac, technology, known, _number(row.get("p_d0", "")), _number(row.get("eta", "")))
-    return found
+        position = np.nan_to_num(np.array(place))
+        anchors[mac] = Anchor(
+            mac, technology, position, _number(row.get("p_d0", "")), _number(row.get("eta", ""))
+        )
+    return anchors
 
 
 def _number(text: str) -> float:

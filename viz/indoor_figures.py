@@ -36,10 +36,10 @@ def _plan(ax: Axes, plan: FloorPlan, *, names: bool = True) -> None:
     for line in plan.outlines:
         ax.plot(line[:, 0], line[:, 1], color="#777777", linewidth=0.8)
     for i, kind in enumerate(dict.fromkeys(a.technology for a in plan.anchors.values())):
-        at = np.array([a.position for a in plan.anchors.values() if a.technology == kind])
+        positions = np.array([a.position for a in plan.anchors.values() if a.technology == kind])
         ax.plot(
-            at[:, 0],
-            at[:, 1],
+            positions[:, 0],
+            positions[:, 1],
             "s^vPX*"[i % 6],
             color="black",
             label=f"anchors {kind}".strip() if names else None,
@@ -58,22 +58,22 @@ def geometry(rec: Recording, fig: Figure) -> None:
     """Cramér–Rao bound, dilution and anchors in reach over the plan, and what one more anchor would bring."""
     from ..replay.geometry import REACH_M, geometry_of
 
-    found, plan = geometry_of(rec), floor_plan(loaders_of(rec))
+    maps, plan = geometry_of(rec), floor_plan(loaders_of(rec))
     fig.set_size_inches(13.0, 7.5)
     axes = fig.subplots(2, 2).ravel()
-    half = (found.x[1] - found.x[0]) / 2
-    extent = (found.x[0] - half, found.x[-1] + half, found.y[0] - half, found.y[-1] + half)
-    medians = [float(np.nanmedian(np.minimum(b, 1e3))) for b in (found.bound_m, found.extra_bound_m)]
+    half = (maps.x[1] - maps.x[0]) / 2
+    extent = (maps.x[0] - half, maps.x[-1] + half, maps.y[0] - half, maps.y[-1] + half)
+    medians = [float(np.nanmedian(np.minimum(b, 1e3))) for b in (maps.bound_m, maps.extra_bound_m)]
     panels = (
         (
-            found.bound_m,
+            maps.bound_m,
             f"least error of one power each (Cramér–Rao), median {medians[0]:.1f} m",
             "m",
             BOUND_LIMIT_M,
         ),
-        (found.dilution, "dilution of precision", "1", 5.0),
-        (found.heard, f"anchors within {REACH_M:g} m", "", max(4.0, float(np.nanmax(found.heard)))),
-        (found.extra_bound_m, f"with one more anchor (★), median {medians[1]:.1f} m", "m", BOUND_LIMIT_M),
+        (maps.dilution, "dilution of precision", "1", 5.0),
+        (maps.heard, f"anchors within {REACH_M:g} m", "", max(4.0, float(np.nanmax(maps.heard)))),
+        (maps.extra_bound_m, f"with one more anchor (★), median {medians[1]:.1f} m", "m", BOUND_LIMIT_M),
     )
     for ax, (values, title, unit, top) in zip(axes, panels, strict=True):
         clipped = np.where(np.isnan(values), np.nan, np.minimum(values, top))
@@ -81,29 +81,29 @@ def geometry(rec: Recording, fig: Figure) -> None:
         fig.colorbar(picture, ax=ax, label=unit, shrink=0.8)
         _plan(ax, plan, names=False)
         _title(ax, title)
-    axes[3].plot(*found.extra, "*", color="red", markersize=14)
+    axes[3].plot(*maps.extra, "*", color="red", markersize=14)
 
 
 def radiomap(rec: Recording, fig: Figure) -> None:
     """Expected power of the anchors over the plan: the survey's radio map, else the log-distance models."""
     from ..replay.geometry import power_map_of
 
-    found, plan = power_map_of(rec), floor_plan(loaders_of(rec))
-    shown = list(range(min(len(found.anchors), MOST_ANCHORS)))
+    power_map, plan = power_map_of(rec), floor_plan(loaders_of(rec))
+    shown = list(range(min(len(power_map.anchors), MOST_ANCHORS)))
     rows = (len(shown) + 2) // 3
     fig.set_size_inches(13.0, 3.4 * rows)
     axes = fig.subplots(rows, min(3, len(shown)), squeeze=False).ravel()
-    extent = (found.x[0], found.x[-1], found.y[0], found.y[-1])
-    low, high = float(found.mean_dbm[shown].min()), float(found.mean_dbm[shown].max())
+    extent = (power_map.x[0], power_map.x[-1], power_map.y[0], power_map.y[-1])
+    low, high = float(power_map.mean_dbm[shown].min()), float(power_map.mean_dbm[shown].max())
     for ax, k in zip(axes, shown, strict=False):
         picture = ax.imshow(
-            found.mean_dbm[k].T, origin="lower", extent=extent, cmap="magma", vmin=low, vmax=high
+            power_map.mean_dbm[k].T, origin="lower", extent=extent, cmap="magma", vmin=low, vmax=high
         )
         fig.colorbar(picture, ax=ax, label="dBm", shrink=0.7)
         _plan(ax, plan, names=False)
-        ax.plot(*found.anchors.plane[k], "*", color="cyan", markersize=11)
-        kind = "surveyed" if found.surveyed else f"η {found.anchors.eta[k]:.2f}"
-        _title(ax, f"{found.anchors.technology[k]} {printable(found.anchors.macs[k])}, {kind}")
+        ax.plot(*power_map.anchors.plane[k], "*", color="cyan", markersize=11)
+        kind = "surveyed" if power_map.surveyed else f"η {power_map.anchors.eta[k]:.2f}"
+        _title(ax, f"{power_map.anchors.technology[k]} {printable(power_map.anchors.macs[k])}, {kind}")
     for ax in axes[len(shown) :]:
         ax.set_axis_off()
 
@@ -173,21 +173,21 @@ def powers(rec: Recording, fig: Figure) -> None:
     """Received power over distance: means with the fitted models and other exponents, histograms by distance."""
     from ..replay import calibrate
 
-    found = calibrate("radio", [rec], {"method": "regression"})[0].values["anchors"]
+    models = calibrate("radio", [rec], {"method": "regression"})[0].values["anchors"]
     try:
         source = {a["mac"]: a for a in calibrate("radio", [rec], {"method": "source"})[0].values["anchors"]}
     except UsageError:
         source = {}
-    known = [a for a in found if a.get("p_d0") is not None][:MOST_ANCHORS]
-    if not known:
+    fitted = [a for a in models if a.get("p_d0") is not None][:MOST_ANCHORS]
+    if not fitted:
         raise UsageError(f"{rec.path}: nothing for this figure: no anchor with powers at four distances")
     anchors = floor_plan(loaders_of(rec)).anchors
     topic = next(t for t, c in rec.channels.items() if c.schema == RADIO and c.count and not is_estimate(t))
     table, truth = rec.table(topic), _truth(rec)
     assert truth is not None  # the calibration found positions
-    fig.set_size_inches(12.0, 3.2 * len(known))
-    axes = fig.subplots(len(known), 2, squeeze=False)
-    for (left, right), one in zip(axes, known, strict=True):
+    fig.set_size_inches(12.0, 3.2 * len(fitted))
+    axes = fig.subplots(len(fitted), 2, squeeze=False)
+    for (left, right), one in zip(axes, fitted, strict=True):
         rows = table.filter(pl.col("mac") == one["mac"])
         anchor = anchors[one["mac"]]
         gone = np.linalg.norm(truth.at(rows["t_ns"].to_numpy()) - anchor.position, axis=1)

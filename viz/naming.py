@@ -10,13 +10,13 @@ ANGLES = ("rad", "rad/s")
 
 def unit_of(schema: str, column: str) -> str:
     """Return the unit that a message type gives a column; empty where it says none."""
-    known = SCHEMAS.get(schema)
-    found: list[Column] = [] if known is None else list(known.columns)
-    if known is not None and known.names:  # a named schema's columns are suffixes behind the name
-        matching = [c for c in found if c.name and column.endswith(c.name)]
-        found = matching or [c for c in found if not c.name]
-        return found[0].unit if found else ""
-    return next((c.unit for c in found if c.name == column), "")
+    registered = SCHEMAS.get(schema)
+    columns: list[Column] = [] if registered is None else list(registered.columns)
+    if registered is not None and registered.names:  # a named schema's columns are suffixes behind the name
+        matching = [c for c in columns if c.name and column.endswith(c.name)]
+        columns = matching or [c for c in columns if not c.name]
+        return columns[0].unit if columns else ""
+    return next((c.unit for c in columns if c.name == column), "")
 
 
 def shown_as(column: str, unit: str = "") -> style.ColumnStyle:

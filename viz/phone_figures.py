@@ -90,16 +90,16 @@ def detector(rec: Recording, fig: Figure) -> None:
 
 def transform(rec: Recording, fig: Figure) -> None:
     """The local track with the fixes' times, then rotated, scaled and moved onto the fixes, pairs joined."""
-    found = [
+    topics = [
         t for t, c in rec.channels.items() if {"rotation_rad", "shift_east_m"} <= set(c.columns) and c.count
     ]
-    if not found:
+    if not topics:
         raise UsageError(f"{rec.path}: nothing for this figure: no transform (estimator phone.transform)")
-    run = found[0].split("/")[2]
+    run = topics[0].split("/")[2]
     inputs = json.loads(rec.metadata.get(f"run/{run}", {}).get("inputs", "{}"))
     if not inputs.get("pose") or not inputs.get("gnss"):
         raise UsageError(f"{rec.path}: run {run} does not say which track it laid on which fixes")
-    about = rec.table(found[0]).row(0, named=True)
+    about = rec.table(topics[0]).row(0, named=True)
     track, seen = rec.table(inputs["pose"][0]), rec.table(inputs["gnss"][0])
     seen = seen.filter(pl.col("lat_deg").is_finite() & pl.col("lon_deg").is_finite())
     t = track["t_ns"].to_numpy()
@@ -123,7 +123,7 @@ def transform(rec: Recording, fig: Figure) -> None:
         (f"moved onto the fixes, residual {about['rms_m']:.1f} m (RMS)", moved),
     )
     for k, (ax, (title, points)) in enumerate(zip(axes, stages, strict=True)):
-        at = np.column_stack([np.interp(when - t[0], t - t[0], points[:, i]) for i in range(2)])
+        positions = np.column_stack([np.interp(when - t[0], t - t[0], points[:, i]) for i in range(2)])
         ax.plot(
             *points.T,
             ".-",
@@ -132,10 +132,10 @@ def transform(rec: Recording, fig: Figure) -> None:
             linewidth=0.8,
             label=_name(inputs["pose"][0]),
         )
-        ax.plot(*at.T, "o", color=PEAK, markersize=5, linestyle="", label="at the fixes' times")
+        ax.plot(*positions.T, "o", color=PEAK, markersize=5, linestyle="", label="at the fixes' times")
         if k == 3:
             ax.plot(*fixes.T, "s", color=style.DEVICE, markersize=5, linestyle="", label="fixes")
-            ax.plot(*np.stack((at, fixes), axis=2).transpose(1, 2, 0), color="#999999", linewidth=0.7)
+            ax.plot(*np.stack((positions, fixes), axis=2).transpose(1, 2, 0), color="#999999", linewidth=0.7)
         frame = f"UTM zone {int(about['zone'])}, about the fixes' mean" if k == 3 else "local"
         _dress(ax, title, f"east, {frame} (m)", "north (m)")
         ax.set_aspect("equal", adjustable="datalim")

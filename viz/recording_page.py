@@ -104,24 +104,24 @@ def _measure(rec: Recording, by: str | None) -> Measured:
     except MarchaError as error:  # raw recordings have no estimates
         return Measured(rec, Evaluation([]), {}, printable(error))
     tiers = [by] if by is not None else _groupings(rec, [r.run for r in whole.runs])
-    found = {}
+    groups = {}
     for tier in tiers:
         try:
-            found[tier] = evaluate(rec, intervals=False, by=tier).runs
+            groups[tier] = evaluate(rec, intervals=False, by=tier).runs
         except UsageError:  # of several recordings not all have it
             continue
-    return Measured(rec, whole, found, "")
+    return Measured(rec, whole, groups, "")
 
 
 def _groupings(rec: Recording, runs: Sequence[str]) -> list[str]:
     """Return the tiers whose labels are worth measuring: few, lasting, not those of every step."""
-    found: dict[str, set[str]] = {}
+    labels_of: dict[str, set[str]] = {}
     for tier, label in (
         rec.annotations.filter(pl.col("end_ns") > pl.col("start_ns")).select("tier", "label").rows()
     ):
         run, _, rest = tier.partition("/")
-        found.setdefault(rest if run in runs else tier, set()).add(label)
-    return [t for t, labels in found.items() if len(labels) <= MOST_LABELS and t not in OF_EVERY_STEP]
+        labels_of.setdefault(rest if run in runs else tier, set()).add(label)
+    return [t for t, labels in labels_of.items() if len(labels) <= MOST_LABELS and t not in OF_EVERY_STEP]
 
 
 def _summary(html: Html, measured: Sequence[Measured]) -> None:
@@ -160,12 +160,12 @@ def _recording(html: Html, one: Measured, part: Callable[[str], None], picture: 
     if runs:
         part("Errors and other figures")
         _figures_table(html, [(r.run, r.metrics) for r in runs])
-        said: dict[str, list[str]] = {}
+        lines: dict[str, list[str]] = {}
         for r in runs:
             if r.alignment:
                 counts = f"{r.matched} samples compared with the reference, {r.dropped} left out"
-                said.setdefault(f"{counts}, alignment {r.alignment}", []).append(r.run)
-        for text, names in said.items():
+                lines.setdefault(f"{counts}, alignment {r.alignment}", []).append(r.run)
+        for text, names in lines.items():
             html.text(f"{', '.join(names)}: {text}.", "note")
         _left_and_right(html, runs)
     elif one.note:
@@ -268,14 +268,14 @@ def _strides_by(html: Html, rec: Recording, tier: str) -> None:
         (pl.col("tier") == tier) | pl.col("tier").str.ends_with(f"/{tier}"),
         pl.col("end_ns") > pl.col("start_ns"),
     )
-    found = joint_cycles(rec, marks)
-    if not found:
+    curves = joint_cycles(rec, marks)
+    if not curves:
         return
     picture = _draw(lambda fig: strides_by(rec, fig, marks))
     caption = f"Joint angles over the gait cycle by {printable(tier)}: mean, and ±1 sd as area."
     html.pictures([PagePicture(f"strides-{tier}", "", caption, picture, b"")])
     rows = []
-    for c in found:
+    for c in curves:
         motion = np.ptp(c.curves, axis=1)
         rows.append(
             [
@@ -392,13 +392,13 @@ def _provenance(html: Html, rec: Recording, part: Callable[[str], None]) -> None
             [escape(k), *(escape(printable(v.get(run, ""))[:80]) for run in runs)] for k, v in rows.items()
         ]
         html.table(["", *(escape(r) for r in runs)], body, 1 + len(runs))
-        found = [
+        findings = [
             [escape(run), escape(kind), str(count), escape(printable(detail))]
             for run, lineage in runs.items()
             for kind, count, detail in json.loads(lineage.get("findings", "[]"))
         ]
-        if found:
-            html.table(["run", "finding", "count", "detail"], found, 2)
+        if findings:
+            html.table(["run", "finding", "count", "detail"], findings, 2)
     part("Channels")
     html.table(
         ["topic", "message", "count", "from (s)", "to (s)"],

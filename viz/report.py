@@ -122,20 +122,20 @@ def _metrics(runs: Sequence[RunEvaluation]) -> list[str]:
 
 
 def _parameters(runs: Mapping[str, Mapping[str, str]]) -> list[str]:
-    given = {run: {k: v for k, v in m.items() if k in LINEAGE} for run, m in runs.items()}
+    by_run = {run: {k: v for k, v in m.items() if k in LINEAGE} for run, m in runs.items()}
     for run, lineage in runs.items():
         params = lineage.get("params", "")
         values = json.loads(params) if params.startswith("{") else {}
         values |= {k.removeprefix("param."): v for k, v in lineage.items() if k.startswith("param.")}
-        given[run] |= {k: str(v) for k, v in values.items()}
-    names = list(dict.fromkeys(k for values in given.values() for k in values))
-    rows = [[n, *(values.get(n, "") for values in given.values())] for n in names]
-    return ["## Runs and their parameters", "", *_table(["", *given], rows)]
+        by_run[run] |= {k: str(v) for k, v in values.items()}
+    names = list(dict.fromkeys(k for values in by_run.values() for k in values))
+    rows = [[n, *(values.get(n, "") for values in by_run.values())] for n in names]
+    return ["## Runs and their parameters", "", *_table(["", *by_run], rows)]
 
 
 def _findings(rows: Iterable[tuple[str, str, int, str]]) -> list[str]:
-    found = [[where, kind, f"{count}", detail] for where, kind, count, detail in rows]
-    return ["## Findings", "", *_table(["where", "kind", "count", "detail"], found)] if found else []
+    entries = [[where, kind, f"{count}", detail] for where, kind, count, detail in rows]
+    return ["## Findings", "", *_table(["where", "kind", "count", "detail"], entries)] if entries else []
 
 
 def _number(value: float | None) -> str:

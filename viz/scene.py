@@ -129,22 +129,22 @@ class Scene:
             _, mark, rest = path.partition("/run/")
             topic = canvas.reference_of(rest.split("/")[0]) if mark else None
             reference = canvas.traces.get(canvas.base(topic)) if topic is not None else None
-            found = compared(trace, reference, canvas.alignment) if reference is not None else None
-            if found is None:
+            comparison = compared(trace, reference, canvas.alignment) if reference is not None else None
+            if comparison is None:
                 continue
-            far = distance(found)
-            trace.place, trace.worst_m = found.transform, float(far.max())
+            far = distance(comparison)
+            trace.place, trace.worst_m = comparison.transform, float(far.max())
             turn = rr.Transform3D(translation=trace.place.translation, mat3x3=trace.place.rotation)
             canvas.static(path, turn)
-            at, owner = path + "/error", trace.owner
-            canvas.lines(at, [f"error {a} (m)" for a in "xyz"], style.AXES)
-            canvas.columns(at, found.t_ns, rr.Scalars.columns(scalars=axes_error(found)))
+            error_path, owner = path + "/error", trace.owner
+            canvas.lines(error_path, [f"error {a} (m)" for a in "xyz"], style.AXES)
+            canvas.columns(error_path, comparison.t_ns, rr.Scalars.columns(scalars=axes_error(comparison)))
             title = f"{owner}: error and ±1σ of the position (m)"
-            canvas.show("plot", at, tab=COMPARE, panel=title, owner=owner, stack="error")
-            at = path + "/distance"
-            canvas.lines(at, [f"{owner} distance (m)"], [trace.color])
-            canvas.columns(at, found.t_ns, rr.Scalars.columns(scalars=far))
-            canvas.show("plot", at, tab=COMPARE, panel="distance to the reference (m)", owner=owner)
+            canvas.show("plot", error_path, tab=COMPARE, panel=title, owner=owner, stack="error")
+            error_path = path + "/distance"
+            canvas.lines(error_path, [f"{owner} distance (m)"], [trace.color])
+            canvas.columns(error_path, comparison.t_ns, rr.Scalars.columns(scalars=far))
+            canvas.show("plot", error_path, tab=COMPARE, panel="distance to the reference (m)", owner=owner)
 
     def _all(self) -> list[View]:
         return [view for views in self.views.values() for view in list(views)]

@@ -109,16 +109,16 @@ def _show_tab(client: Any, layout: dict[str, Any], name: str, path: Path, patien
     containers = {
         k.lstrip("/"): v["ContainerBlueprint"] for k, v in layout.items() if "ContainerBlueprint" in v
     }
-    found = next((k for k, c in containers.items() if c.get("display_name") == name), None)
-    if found is None:
+    tab_id = next((k for k, c in containers.items() if c.get("display_name") == name), None)
+    if tab_id is None:
         names = sorted({c["display_name"] for c in containers.values() if "display_name" in c})
         raise MarchaError(f"{path}: no tab {name!r}; it has {', '.join(names)}")
-    outer = next(k for k, c in containers.items() if c["container_kind"] == "Tabs" and found in _contents(c))
-    containers[outer]["active_tab"] = found
+    outer = next(k for k, c in containers.items() if c["container_kind"] == "Tabs" and tab_id in _contents(c))
+    containers[outer]["active_tab"] = tab_id
     layout["/top_panel"] = {"PanelBlueprint": {"state": "Hidden"}}
     client.set_blueprint(layout, of="recording")
     # the viewer shows it some frames later: views of hidden tabs have no picture
-    part = found
+    part = tab_id
     while part in containers:
         part = _contents(containers[part])[0]
     until = time.monotonic() + patience_s
@@ -132,5 +132,5 @@ def _show_tab(client: Any, layout: dict[str, Any], name: str, path: Path, patien
 
 
 def _contents(container: dict[str, Any]) -> list[str]:
-    found = container.get("contents", [])
-    return [found] if isinstance(found, str) else found
+    contents = container.get("contents", [])
+    return [contents] if isinstance(contents, str) else contents

@@ -71,11 +71,11 @@ def metres_a_degree(lat_deg: Floats) -> Floats:
 def thinned(t_ns: Times, next_ns: int) -> tuple[NDArray[np.int64], int]:
     """Return which rows are at least :data:`BEAT_NS` apart, and when the next one is due."""
     kept = []
-    at = 0
-    while at < len(t_ns):
-        at += int(np.searchsorted(t_ns[at:], next_ns))
-        if at < len(t_ns):
-            kept.append(at)
-            next_ns = int(t_ns[at]) + BEAT_NS
-            at += 1
+    index = 0
+    while index < len(t_ns):
+        index += int(np.searchsorted(t_ns[index:], next_ns))
+        if index < len(t_ns):
+            kept.append(index)
+            next_ns = int(t_ns[index]) + BEAT_NS
+            index += 1
     return np.array(kept, dtype=np.int64), next_ns

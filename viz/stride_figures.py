@@ -77,7 +77,7 @@ def joint_cycles(rec: Recording, tier: pl.DataFrame | None = None) -> list[Cycle
     topics = [t for t, c in rec.channels.items() if c.schema == JOINT_STATE and c.count]
     topics.sort(key=lambda t: ROLES.index(role_of(t)) if role_of(t) in ROLES else 1)
     starts: dict[str, NDArray[np.int64]] = {}
-    found = []
+    result = []
     for topic in topics:
         table = rec.table(topic)
         for joint in joint_columns(table):
@@ -93,8 +93,8 @@ def joint_cycles(rec: Recording, tier: pl.DataFrame | None = None) -> list[Cycle
                 curves = np.concatenate([np.empty((0, 101)), *(cycles_of(t_ns, angle, p) for p in parts)])
                 curves = np.degrees(curves[np.isfinite(curves).all(axis=1)])
                 if len(curves) >= LEAST:
-                    found.append(Cycles(owner, joint, base, side, label, curves))
-    return found
+                    result.append(Cycles(owner, joint, base, side, label, curves))
+    return result
 
 
 def _parts(starts: NDArray[np.int64], tier: pl.DataFrame | None) -> dict[str, list[NDArray[np.int64]]]:
@@ -122,17 +122,17 @@ def strides_by(rec: Recording, fig: Figure, tier: pl.DataFrame) -> None:
     _draw(rec, fig, joint_cycles(rec, tier))
 
 
-def _draw(rec: Recording, fig: Figure, found: list[Cycles]) -> None:
-    if not found:
+def _draw(rec: Recording, fig: Figure, curves: list[Cycles]) -> None:
+    if not curves:
         raise UsageError(f"{rec.path}: nothing for this figure: no joint with {LEAST} cycles of gait")
-    by_label = any(c.label for c in found)
-    rows = list(dict.fromkeys(c.base for c in found))
-    owners = list(dict.fromkeys(c.owner for c in found)) if by_label else [""]
+    by_label = any(c.label for c in curves)
+    rows = list(dict.fromkeys(c.base for c in curves))
+    owners = list(dict.fromkeys(c.owner for c in curves)) if by_label else [""]
     fig.set_size_inches(max(6.5, 5.0 * len(owners)), 0.8 + 3.2 * len(rows))
     axes = fig.subplots(len(rows), len(owners), squeeze=False, sharey="row")
     for row, base in zip(axes, rows, strict=True):
         for ax, owner in zip(row, owners, strict=True):
-            mine = [c for c in found if c.base == base and owner in ("", c.owner)]
+            mine = [c for c in curves if c.base == base and owner in ("", c.owner)]
             if not mine:
                 ax.set_axis_off()
                 continue

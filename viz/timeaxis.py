@@ -41,24 +41,24 @@ class TimeAxis:
     def columns(self, t_ns: Times) -> list[rr.TimeColumn]:
         """Return recorded times as columns of the time lines."""
         since = (t_ns - self.zero_ns).astype("timedelta64[ns]")
-        found = [rr.TimeColumn(SINCE_START, duration=since)]
+        result = [rr.TimeColumn(SINCE_START, duration=since)]
         if self.utc:
-            found.append(rr.TimeColumn(UTC, timestamp=t_ns.astype("datetime64[ns]")))
-        return found
+            result.append(rr.TimeColumn(UTC, timestamp=t_ns.astype("datetime64[ns]")))
+        return result
 
 
-def axis_from(t_ns: int, said: str = "") -> TimeAxis:
+def axis_from(t_ns: int, clock: str = "") -> TimeAxis:
     """Return the axis of a recording that begins at ``t_ns``.
 
     Parameters
     ----------
     t_ns : int
         First recorded time.
-    said : str
+    clock : str
         What the recording's metadata calls its clock (``device``: it has no epoch); empty where it says
         nothing, and then the time itself decides.
     """
-    return TimeAxis(t_ns, said != "device" and t_ns >= EPOCH_NS)
+    return TimeAxis(t_ns, clock != "device" and t_ns >= EPOCH_NS)
 
 
 def axes_of(recs: Sequence[Recording]) -> list[TimeAxis]:

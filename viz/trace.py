@@ -153,15 +153,15 @@ def compared(trace: Trace, reference: Trace, alignment: str) -> Comparison | Non
         reference=reference.table(),
         alignment=alignment,
     )
-    found = compare(view, alignment)
-    return found if found is not None and len(found.t_ns) > 1 else None
+    comparison = compare(view, alignment)
+    return comparison if comparison is not None and len(comparison.t_ns) > 1 else None
 
 
-def axes_error(found: Comparison) -> Floats:
+def axes_error(comparison: Comparison) -> Floats:
     """Return the error (n, 3), m, in the track's own axes: those in which its sigma is stated."""
-    return found.error @ found.transform.rotation
+    return comparison.error @ comparison.transform.rotation
 
 
-def distance(found: Comparison) -> Floats:
+def distance(comparison: Comparison) -> Floats:
     """Return distances (n,) to the reference, m."""
-    return np.sqrt(np.sum(found.error**2, axis=1))
+    return np.sqrt(np.sum(comparison.error**2, axis=1))

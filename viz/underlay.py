@@ -46,6 +46,6 @@ def _streets(data: bytes) -> list[Floats]:
 
 
 def _corners(data: bytes) -> tuple[float, float, float, float]:
-    known = json.loads(data)
-    west, east, south, north = (float(known[f"{k}_deg"]) for k in ("west", "east", "south", "north"))
+    corners = json.loads(data)
+    west, east, south, north = (float(corners[f"{k}_deg"]) for k in ("west", "east", "south", "north"))
     return west, east, south, north

@@ -153,8 +153,8 @@ def offline() -> dict[str, str]:
     """Return environment variables under which a program finds no other host."""
     names = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY")
     here = f"{HOST},localhost"
-    found = {"NO_PROXY": here, "no_proxy": here}
-    return {**dict.fromkeys(names, NOWHERE), **{n.lower(): NOWHERE for n in names}, **found}
+    reachable = {"NO_PROXY": here, "no_proxy": here}
+    return {**dict.fromkeys(names, NOWHERE), **{n.lower(): NOWHERE for n in names}, **reachable}
 
 
 def native(*, headless: bool = False, size: tuple[int, int] | None = None, online: bool = False) -> Viewer:

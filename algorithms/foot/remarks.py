@@ -20,10 +20,10 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
     taken, elapsed = int(s.taken), s.time
     if taken == 0:
         return [Remark("no_data", "no row was given; nothing was estimated", fatal=True)]
-    found: list[Remark] = []
+    result: list[Remark] = []
     if s.repaired > 0:
         share = s.repaired / taken
-        found.append(
+        result.append(
             Remark(
                 "not_finite",
                 f"{s.repaired} of {taken} rows held a value that is not finite; the previous one was kept",
@@ -33,7 +33,7 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
     for i, column in enumerate(IMU_COLUMNS):
         low, high = s.lowest[i], s.highest[i]
         if low == high and taken >= 10:
-            found.append(
+            result.append(
                 Remark(
                     "dead_axis",
                     f"{column} is {low:g} in all {taken} rows: that axis is missing or broken; "
@@ -44,7 +44,7 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
     if elapsed > 0 and taken > 10:
         measured = (taken - 1) / elapsed
         if not 0.8 < measured / rate_hz < 1.25:
-            found.append(
+            result.append(
                 Remark(
                     "rate_mismatch",
                     f"windows were laid out for {rate_hz:g} Hz but rows come at {measured:.1f} Hz, so they "
@@ -52,7 +52,7 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
                 )
             )
     if s.rest.index < 0:
-        found.append(
+        result.append(
             Remark(
                 "no_rest",
                 f"no rest of {p.init_s:g} s anywhere in {elapsed:.1f} s (longest {s.rest.longest:.2f} "
@@ -62,11 +62,11 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
                 fatal=True,
             )
         )
-        return found
+        return result
     start = s.rest.begin
     moved = s.rest.moved + s.rest.moved_before
     if s.rest.moved_before > rate_hz and s.rest.moved_before > 0.5 * moved:
-        found.append(
+        result.append(
             Remark(
                 "late_start",
                 f"the first rest begins at {start:.2f} s, after {100 * s.rest.moved_before / moved:.0f} % of "
@@ -77,7 +77,7 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
         )
     elif start > 0.5:
         wanted = f"{p.init_s:g} s" if p.init == "fixed" else f"{min(p.init_min_s, p.init_s):g} s"
-        found.append(
+        result.append(
             Remark(
                 "no_rest",
                 f"no rest of {wanted} at the start; the first one begins at {start:.2f} s, and the "
@@ -90,7 +90,7 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
     if s.rest.adaptive and s.rest.quietest < math.inf:
         spread = math.sqrt(max(0.0, s.rest.quietest))
     elif s.rest.adaptive:
-        found.append(
+        result.append(
             Remark(
                 "short_rest",
                 f"the rest at {start:.2f} s lasts {s.rest.elapsed:.2f} s: too short to tell the gyroscope's "
@@ -98,7 +98,7 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
             )
         )
     if spread > RESTLESS:
-        found.append(
+        result.append(
             Remark(
                 "restless",
                 f"in the rest at {start:.2f} s the angular rate spreads by {spread:.3f} rad/s (a sensor "
@@ -110,7 +110,7 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
     ax, ay, az = s.rest.acc
     norm = math.sqrt(ax * ax + ay * ay + az * az)
     if abs(norm - p.gravity) > 0.3 * p.gravity:
-        found.append(
+        result.append(
             Remark(
                 "unit_doubt",
                 f"‖f‖ at rest is {norm:.3f} m/s², gravity {p.gravity:g}: are the values in g or in counts?",
@@ -118,7 +118,7 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
             )
         )
     elif abs(norm - p.gravity) > 0.02 * p.gravity:
-        found.append(
+        result.append(
             Remark(
                 "gravity_norm",
                 f"‖f‖ at rest is {norm:.3f} m/s², {100 * (norm / p.gravity - 1):+.1f} % off gravity "
@@ -129,7 +129,7 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
     if az < 0:
         roll = math.degrees(math.atan2(ay, az))
         pitch = math.degrees(math.atan2(-ax, math.hypot(ay, az)))
-        found.append(
+        result.append(
             Remark(
                 "upside_down",
                 f"the sensor's z axis points down at rest (roll {roll:.0f}°, pitch {pitch:.0f}°); it was "
@@ -137,14 +137,14 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
             )
         )
     if s.rest.moved == 0:
-        found.append(
+        result.append(
             Remark(
                 "never_moved",
                 f"nothing moved after the rest ({elapsed:.1f} s in all): there is no walk in it",
             )
         )
     elif s.started and s.n_still == 0 and taken > s.rest.index + 2 * s.detector.latency + 10:
-        found.append(
+        result.append(
             Remark(
                 "never_still",
                 f"the detector {p.detector} never found the foot still: nothing was corrected; check its "
@@ -153,21 +153,21 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
             )
         )
     elif s.steps.count == 0 and s.rest.moved <= rate_hz:
-        found.append(
+        result.append(
             Remark(
                 "no_step",
                 f"after the rest it moved for {s.rest.moved / rate_hz:.2f} s only: there is no step in it",
             )
         )
     elif s.steps.count == 0:
-        found.append(
+        result.append(
             Remark("no_step", "the sensor moved, but no step was found: wrong detector or wrong mounting?")
         )
-    found += verdict(s, p) if is_corrected else []
+    result += verdict(s, p) if is_corrected else []
     position = s.pos
     if s.started and not (np.all(np.isfinite(position)) and np.all(np.abs(position) < 1e6)):
-        found.append(Remark("diverged", f"the position ran away to {position} m", fatal=True))
-    return found
+        result.append(Remark("diverged", f"the position ran away to {position} m", fatal=True))
+    return result
 
 
 FASTEST = 15.0
@@ -192,9 +192,9 @@ LEAST_CEILING = (15.0, 15.0, 15.0, 3.0, 3.0, 3.0)
 
 def verdict(s: Any, p: Any) -> list[Remark]:
     """Return what speaks against the results being a walk."""
-    v, found = s.verdict, []
+    v, result = s.verdict, []
     if v.fastest > FASTEST:
-        found.append(
+        result.append(
             Remark(
                 "implausible_speed",
                 f"the foot reaches {v.fastest:.1f} m/s (a runner's: up to {FASTEST:g}): stances were missed; try "
@@ -204,7 +204,7 @@ def verdict(s: Any, p: Any) -> list[Remark]:
         )
     if v.n_long_strides:
         share = v.n_long_strides / max(1, v.n_landings)
-        found.append(
+        result.append(
             Remark(
                 "implausible_stride",
                 f"{v.n_long_strides} of {v.n_landings} strides are longer than 4 m (longest "
@@ -214,7 +214,7 @@ def verdict(s: Any, p: Any) -> list[Remark]:
         )
     if v.lost_s > 0.0:
         share = v.lost_s / v.navigated_s
-        found.append(
+        result.append(
             Remark(
                 "lost_stances",
                 f"for {v.lost_s:.1f} s ({100 * share:.0f} % of the time) no stance was found within 5 s: the "
@@ -223,20 +223,20 @@ def verdict(s: Any, p: Any) -> list[Remark]:
             )
         )
     if v.n_landings >= 20 and v.n_landings > 3 * s.steps.count:
-        found.append(
+        result.append(
             Remark(
                 "not_gait",
                 f"{v.n_landings} stances make only {s.steps.count} steps: this is no walk, or the detector "
                 f"{p.detector} breaks its stances; the position between them is doubtful",
             )
         )
-    found += _against_the_gait(s)
-    found += _against_the_filter(s)
+    result += _against_the_gait(s)
+    result += _against_the_filter(s)
     swing_rows = max(1, s.taken - s.n_still)
     for i, column in enumerate(IMU_COLUMNS):
         for value, count in ((s.lowest[i], v.at_lowest[i]), (s.highest[i], v.at_highest[i])):
             if count >= CLIPPED_SAMPLES and abs(value) > LEAST_CEILING[i]:
-                found.append(
+                result.append(
                     Remark(
                         "clipped",
                         f"{column} stands at its extreme {value:.4g} in {count} rows "
@@ -244,14 +244,14 @@ def verdict(s: Any, p: Any) -> list[Remark]:
                         "this walk, turns and speeds in the swing are underestimated",
                     )
                 )
-    return found
+    return result
 
 
 def _against_the_gait(s: Any) -> list[Remark]:
     """Return what disagrees between steps, track and the swings that the gyroscope alone counts."""
-    v, steps, found = s.verdict, int(s.steps.count), []
+    v, steps, result = s.verdict, int(s.steps.count), []
     if max(steps, v.swings) >= LEAST_JUDGED and min(steps, v.swings) < FEWEST_STEPS * max(steps, v.swings):
-        found.append(
+        result.append(
             Remark(
                 "steps_against_swings",
                 f"{steps} steps were found, but the gyroscope tells of {v.swings} swings: "
@@ -260,22 +260,22 @@ def _against_the_gait(s: Any) -> list[Remark]:
         )
     way = v.path_m / v.steps_m if v.steps_m > 0.0 else math.inf
     if v.path_m > 10.0 and way > WAY_IN_STEPS[0]:
-        found.append(
+        result.append(
             Remark(
                 "path_against_steps",
                 f"the track is {v.path_m:.1f} m long, the steps together {v.steps_m:.1f} m: it moves between the steps",
                 fatal=bool(way > WAY_IN_STEPS[1]),
             )
         )
-    return found
+    return result
 
 
 def _against_the_filter(s: Any) -> list[Remark]:
     """Return where the filter contradicts itself: innovations, bias, its own standard deviation."""
-    v, found = s.verdict, []
+    v, result = s.verdict, []
     share = v.n_surprising / max(1, v.n_judged)
     if v.n_judged >= LEAST_JUDGED and share > SURPRISING:
-        found.append(
+        result.append(
             Remark(
                 "inconsistent",
                 f"in {v.n_surprising} of {v.n_judged} stances the velocity is farther from zero than the filter "
@@ -284,24 +284,24 @@ def _against_the_filter(s: Any) -> list[Remark]:
             )
         )
     moved = max(abs(s.bias_gyr[i] - v.first_bias[i]) for i in range(3))
-    known = math.sqrt(max(s.rest.bias_variance, BIAS_CHANGE * BIAS_CHANGE))
-    if moved > BIAS_MOVED[0] * known:
+    doubt = math.sqrt(max(s.rest.bias_variance, BIAS_CHANGE * BIAS_CHANGE))
+    if moved > BIAS_MOVED[0] * doubt:
         # A rest of a fixed length does not say how well it knows the bias.
-        fatal = s.rest.adaptive and moved > max(BIAS_MOVED[1] * known, LEAST_BIAS_MOVED)
-        found.append(
+        fatal = s.rest.adaptive and moved > max(BIAS_MOVED[1] * doubt, LEAST_BIAS_MOVED)
+        result.append(
             Remark(
                 "bias_moved",
-                f"the gyroscope's bias moved by {moved:.4f} rad/s, {moved / known:.0f} times what the rest leaves "
+                f"the gyroscope's bias moved by {moved:.4f} rad/s, {moved / doubt:.0f} times what the rest leaves "
                 f"open: other errors (scale, a range too small) are taken for it; foot.9iez estimates none",
                 fatal=bool(fatal),
             )
         )
     if v.unsure_m > UNSURE_M:
-        found.append(
+        result.append(
             Remark(
                 "unsure",
                 f"the filter's own standard deviation of the horizontal position is {v.unsure_m:.1f} m at the end: "
                 f"the rest says too little about the gyroscope's bias; stand still for longer",
             )
         )
-    return found
+    return result

@@ -91,7 +91,7 @@ def parse_anchors(data: bytes, label: str = ATTACHMENT) -> list[dict[str, Any]]:
     missing = [c for c in ("mac", "x", "y") if c not in (rows.fieldnames or ())]
     if missing:
         raise AlgorithmError(f"{label}: no column {missing[0]!r}; an anchor table has {', '.join(COLUMNS)}")
-    found: list[dict[str, Any]] = []
+    anchors: list[dict[str, Any]] = []
     for line, row in enumerate(rows, start=2):
         one: dict[str, Any] = {
             "mac": (row.get("mac") or "").strip().lower(),
@@ -106,10 +106,10 @@ def parse_anchors(data: bytes, label: str = ATTACHMENT) -> list[dict[str, Any]]:
                 raise AlgorithmError(f"{label}, line {line}: {key} {text!r} is not a number") from None
         if not one["mac"] or not (math.isfinite(one["x"]) and math.isfinite(one["y"])):
             raise AlgorithmError(f"{label}, line {line}: an anchor has an address, x and y")
-        if any(one["mac"] == other["mac"] for other in found):
+        if any(one["mac"] == other["mac"] for other in anchors):
             raise AlgorithmError(f"{label}, line {line}: {one['mac']} is there twice; keep one")
-        found.append(one)
-    return found
+        anchors.append(one)
+    return anchors
 
 
 def anchors_of(context: Context, *, without: str = "", need_model: bool = True) -> Anchors:
@@ -202,20 +202,20 @@ def _pooled(
     rows: list[dict[str, Any]], values: Mapping[str, Any], offset: float
 ) -> dict[str, tuple[float, float, float]]:
     """Return (P_d0, η, σ) by technology: as calibrated, else the means of the table's anchors; "" of all."""
-    found = {
+    models = {
         str(t): (float(v["p_d0"]) + offset, float(v["eta"]), float(v.get("sigma_db", USUAL_SIGMA_DB)))
         for t, v in dict(values.get("pooled", {})).items()
     }
-    for technology in {r["technology"] for r in rows} - set(found):
-        known = [
+    for technology in {r["technology"] for r in rows} - set(models):
+        stated = [
             (r["p_d0"], r["eta"], r["sigma_db"] if r["sigma_db"] == r["sigma_db"] else USUAL_SIGMA_DB)
             for r in rows
             if r["technology"] == technology and not math.isnan(r["p_d0"]) and not math.isnan(r["eta"])
         ]
-        if known:
-            mean = np.mean(known, axis=0)
-            found[technology] = (float(mean[0]), float(mean[1]), float(mean[2]))
-    return found
+        if stated:
+            mean = np.mean(stated, axis=0)
+            models[technology] = (float(mean[0]), float(mean[1]), float(mean[2]))
+    return models
 
 
 def _names(rows: list[dict[str, Any]]) -> str:

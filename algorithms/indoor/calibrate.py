@@ -119,9 +119,9 @@ class RadioCalibration(Calibrator):
         t = reference[0]["t_ns"].to_numpy()
         xyz = reference[0].select(XYZ).to_numpy()
         for table in stretch.tables["radio"]:
-            at = table["t_ns"].to_numpy()
-            inside = (at >= t[0]) & (at <= t[-1])
-            where = np.column_stack([np.interp(at - t[0], t - t[0], xyz[:, i]) for i in range(3)])
+            t_ns = table["t_ns"].to_numpy()
+            inside = (t_ns >= t[0]) & (t_ns <= t[-1])
+            where = np.column_stack([np.interp(t_ns - t[0], t - t[0], xyz[:, i]) for i in range(3)])
             where = np.nan_to_num(where)
             cells = np.round(where / self.params.cell_m).astype(int).tolist()
             powers = table["rssi_dbm"].to_numpy()
@@ -134,30 +134,30 @@ class RadioCalibration(Calibrator):
 
     def _result(self, anchors: dict[str, dict[str, Any]], points: dict[str, list[_Mean]]) -> Calibration:
         remarks: list[str] = []
-        known = {m: found for m, found in points.items() if m in anchors}
-        offsets = self._offsets(anchors, known)
+        measured = {m: means for m, means in points.items() if m in anchors}
+        offsets = self._offsets(anchors, measured)
         pooled: dict[str, dict[str, float]] = {}
-        for technology in sorted({anchors[m]["technology"] for m in known}):
-            mine = [m for m in known if anchors[m]["technology"] == technology]
+        for technology in sorted({anchors[m]["technology"] for m in measured}):
+            mine = [m for m in measured if anchors[m]["technology"] == technology]
             try:
-                pooled[technology] = self._fit([(anchors[m], known[m]) for m in mine], offsets)[0]
+                pooled[technology] = self._fit([(anchors[m], measured[m]) for m in mine], offsets)[0]
             except AlgorithmError as error:
                 remarks.append(f"{technology}: {error}")
         out: list[dict[str, Any]] = []
-        for mac, found in sorted(known.items()):
+        for mac, means in sorted(measured.items()):
             row = anchors[mac]
             one: dict[str, Any] = {k: row[k] for k in ("mac", "technology", "x", "y")} | {"points": []}
             if row["z"] == row["z"]:
                 one["z"] = row["z"]
-            if len(found) >= self.params.least_points:
+            if len(means) >= self.params.least_points:
                 try:
-                    values, doubt = self._fit([(row, found)], offsets)
+                    values, doubt = self._fit([(row, means)], offsets)
                     one |= values
                     if doubt:
                         remarks.append(f"anchor {row['name'] or mac}: {doubt}")
                 except AlgorithmError as error:
                     remarks.append(f"anchor {row['name'] or mac}: {error}")
-            one["points"] = [[*map(float, p.where), p.power - offsets.get(p.device, 0.0)] for p in found]
+            one["points"] = [[*map(float, p.where), p.power - offsets.get(p.device, 0.0)] for p in means]
             out.append(one)
         own = sum("p_d0" in a for a in out)
         if not anchors:
@@ -172,7 +172,7 @@ class RadioCalibration(Calibrator):
             f"radio map of {len(places)} places, {len(points)} transmitters, {area['area_m2']:.0f} m²; within it the "
             f"nearest place is {area['median_m']:.1f} m away (median), {area['most_m']:.1f} m at most"
         )
-        height = float(np.mean([p.where[2] for found in points.values() for p in found]))
+        height = float(np.mean([p.where[2] for means in points.values() for p in means]))
         values = {
             "anchors": out,
             "pooled": pooled,
@@ -185,13 +185,13 @@ class RadioCalibration(Calibrator):
 
     def _places(self, points: dict[str, list[_Mean]], offsets: dict[str, float]) -> list[Place]:
         """Return what was heard at each place, by all transmitters."""
-        found: dict[tuple[int, ...], list[tuple[str, _Mean]]] = {}
+        heard_in: dict[tuple[int, ...], list[tuple[str, _Mean]]] = {}
         for mac, means in points.items():
             for mean in means:
                 cell = tuple(np.round(mean.where / self.params.cell_m).astype(int).tolist())
-                found.setdefault(cell, []).append((mac, mean))
+                heard_in.setdefault(cell, []).append((mac, mean))
         places = []
-        for heard in found.values():
+        for heard in heard_in.values():
             where = np.mean([m.where for _, m in heard], axis=0)
             powers: dict[str, list[_Mean]] = {}
             for mac, mean in heard:
@@ -207,22 +207,24 @@ class RadioCalibration(Calibrator):
             places.append(Place(where, dbm, max(m.count for _, m in heard)))
         return places
 
-    def _offsets(self, anchors: dict[str, dict[str, Any]], known: dict[str, list[_Mean]]) -> dict[str, float]:
+    def _offsets(
+        self, anchors: dict[str, dict[str, Any]], measured: dict[str, list[_Mean]]
+    ) -> dict[str, float]:
         """Return each receiver's offset (dB), of mean 0, where several took part: models and offsets in turn."""
-        devices = sorted({p.device for found in known.values() for p in found})
+        devices = sorted({p.device for means in measured.values() for p in means})
         offsets = dict.fromkeys(devices, 0.0)
         if len(devices) < 2:
             return offsets
         for _ in range(ROUNDS):
             left: dict[str, list[float]] = {d: [] for d in devices}
-            for mac, found in known.items():
-                if len(found) < self.params.least_points:
+            for mac, means in measured.items():
+                if len(means) < self.params.least_points:
                     continue
-                d = self._distances(anchors[mac], found)
-                corrected = np.array([p.power - offsets[p.device] for p in found])
+                d = self._distances(anchors[mac], means)
+                corrected = np.array([p.power - offsets[p.device] for p in means])
                 model = regress(d, corrected)
                 residual = corrected - power_dbm(d, model.p_d0_dbm, model.eta)
-                for p, r in zip(found, residual.tolist(), strict=True):
+                for p, r in zip(means, residual.tolist(), strict=True):
                     left[p.device].append(r)
             offsets = {d: offsets[d] + (float(np.mean(left[d])) if left[d] else 0.0) for d in devices}
             middle = float(np.mean(list(offsets.values())))
@@ -233,8 +235,8 @@ class RadioCalibration(Calibrator):
         self, parts: Sequence[tuple[dict[str, Any], list[_Mean]]], offsets: dict[str, float]
     ) -> tuple[dict[str, float], str]:
         """Return the model's values of anchors taken together, and what is doubtful about it."""
-        d = np.concatenate([self._distances(anchor, found) for anchor, found in parts])
-        means = [p for _, found in parts for p in found]
+        d = np.concatenate([self._distances(anchor, means_of) for anchor, means_of in parts])
+        means = [p for _, means_of in parts for p in means_of]
         powers = np.array([p.power - offsets.get(p.device, 0.0) for p in means])
         model = self._model(d, powers)
         within = float(np.sqrt(np.mean(np.square([p.sd for p in means]))))
@@ -251,6 +253,6 @@ class RadioCalibration(Calibrator):
         return regress(d, p) if self.params.method == "regression" else calibrate_by_distances(d, p)
 
     @staticmethod
-    def _distances(anchor: dict[str, Any], found: Sequence[_Mean]) -> FloatArray:
-        delta = np.array([p.where for p in found]) - np.array([anchor["x"], anchor["y"], anchor["z"]])
+    def _distances(anchor: dict[str, Any], means: Sequence[_Mean]) -> FloatArray:
+        delta = np.array([p.where for p in means]) - np.array([anchor["x"], anchor["y"], anchor["z"]])
         return np.maximum(np.sqrt((np.nan_to_num(delta) ** 2).sum(axis=1)), 0.1)

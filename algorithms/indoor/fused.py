@@ -155,8 +155,8 @@ class IndoorFused(KernelEstimator):
             margin = p.margin_m if len(anchors) else 500.0
             low, high = around.min(axis=0) - margin, around.max(axis=0) + margin
             cell, cells = 0.0, np.ones((1, 1), np.uint8)
-        x_axis, mirrored, known = plan_frame(context, p.x_axis_azimuth_deg)
-        if stepped and not context.has("steps") and not known and p.heading_sd_deg < 90:
+        x_axis, mirrored, oriented = plan_frame(context, p.x_axis_azimuth_deg)
+        if stepped and not context.has("steps") and not oriented and p.heading_sd_deg < 90:
             self.start_remarks.append(
                 Remark(
                     "plan_north", "the plan does not say where north is: its x axis is taken to point north"

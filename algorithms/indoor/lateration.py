@@ -64,12 +64,12 @@ def mean_of_triples(anchors: ArrayLike, ranges: ArrayLike, *, least_flatness: fl
         Triples of a :func:`flatness` below this are left out.
     """
     a, d = np.asarray(anchors, dtype=np.float64), np.asarray(ranges, dtype=np.float64)
-    found = [
+    positions = [
         solve_triple(a[list(three)], d[list(three)])
         for three in combinations(range(len(d)), 3)
         if flatness(a[list(three)]) >= least_flatness
     ]
-    return np.mean(found, axis=0) if found else np.full(2, np.nan)
+    return np.mean(positions, axis=0) if positions else np.full(2, np.nan)
 
 
 def votes(anchors: ArrayLike, ranges: ArrayLike, *, both: bool = False) -> FloatArray:

@@ -46,13 +46,13 @@ def places_of(context: Context) -> list[Place]:
         There are none; says how to get them.
     """
     calibration = context.calibrations.get("radio")
-    found = calibration.values.get("places", []) if calibration is not None and calibration.usable else []
-    if not found:
+    places = calibration.values.get("places", []) if calibration is not None and calibration.usable else []
+    if not places:
         raise AlgorithmError(
             "no radio map: calibrate one from a survey (marcha calibrate radio SURVEY -o radio.json) and give it with "
             "--calibration radio.json"
         )
-    return [Place(np.array([p["x"], p["y"], p["z"]]), p["powers"], int(p.get("count", 1))) for p in found]
+    return [Place(np.array([p["x"], p["y"], p["z"]]), p["powers"], int(p.get("count", 1))) for p in places]
 
 
 def coverage(where: Sequence[FloatArray]) -> dict[str, float]:

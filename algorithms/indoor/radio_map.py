@@ -123,10 +123,10 @@ def field_of(where: FloatArray, powers: FloatArray) -> RadioField:
     grid = grid[near <= max(margin, 0.75 * apart)]
     count = powers.shape[1]
     mean, sd = np.full((count, len(grid)), np.nan), np.full((count, len(grid)), np.nan)
-    known = np.isfinite(powers).sum(axis=0) >= 3
+    covered = np.isfinite(powers).sum(axis=0) >= 3
     between = np.linalg.norm(where[:, None] - where[None], axis=2)
     cross = np.exp(-np.linalg.norm(grid[:, None] - where[None], axis=2) / LENGTH_M)
-    for k in np.flatnonzero(known).tolist():
+    for k in np.flatnonzero(covered).tolist():
         here = np.isfinite(powers[:, k])
         p = powers[here, k]
         top = where[here][np.argsort(-p)[: max(1, here.sum() // 10)]].mean(axis=0)
@@ -145,4 +145,4 @@ def field_of(where: FloatArray, powers: FloatArray) -> RadioField:
         mean[k] = level - eta * 10 * np.log10(1 + np.linalg.norm(grid - top, axis=1)) + weights @ left
         spread = 0.5 * variance - np.einsum("ij,ij->i", weights, 0.5 * variance * cross[:, here])
         sd[k] = np.sqrt(np.maximum(spread, 0.0) + 0.25 * variance)
-    return RadioField(grid, mean, sd, known)
+    return RadioField(grid, mean, sd, covered)

@@ -66,9 +66,9 @@ class IndoorSmooth(PlainEstimator):
         values = np.full((len(self.kept), 4), np.nan)
         for index, channel in sorted(set(zip(inputs.tolist(), channels.tolist(), strict=True))):
             mine = np.flatnonzero((inputs == index) & (channels == channel))
-            given = [self.kept[k][3] for k in mine.tolist()]
+            rows = [self.kept[k][3] for k in mine.tolist()]
             table = pl.DataFrame(
-                given, schema=list(self.inputs[index].columns), orient="row", infer_schema_length=None
+                rows, schema=list(self.inputs[index].columns), orient="row", infer_schema_length=None
             )
             encoded = self.ahead.encode(index, channel, table)
             values[mine, : encoded.shape[1]] = encoded
@@ -95,9 +95,9 @@ class IndoorSmooth(PlainEstimator):
         self, filter_: IndoorFused, inputs: Any, channels: Any, t_ns: IntArray, values: FloatArray
     ) -> tuple[IntArray, IntArray, FloatArray]:
         n = len(t_ns)
-        at, when, out = np.zeros(n, np.int64), np.zeros(n, np.int64), np.full((n, 6), np.nan)
-        count = filter_.run(filter_.state, inputs, channels, t_ns, values, at, when, out)
-        return at[:count], when[:count], out[:count]
+        causes, when, out = np.zeros(n, np.int64), np.zeros(n, np.int64), np.full((n, 6), np.nan)
+        count = filter_.run(filter_.state, inputs, channels, t_ns, values, causes, when, out)
+        return causes[:count], when[:count], out[:count]
 
     def _forward(
         self, inputs: Any, channels: Any, t_ns: IntArray, values: FloatArray
@@ -119,21 +119,21 @@ class IndoorSmooth(PlainEstimator):
     ) -> dict[int, FloatArray]:
         """Return what the filter says that has only seen what comes after a time, by that time."""
         keep = np.flatnonzero((inputs <= STEPS) | np.isin(np.arange(len(inputs)), list(stepped)))[::-1]
-        kinds, given = inputs[keep].copy(), values[keep].copy()
+        kinds, backward = inputs[keep].copy(), values[keep].copy()
         for row, m in enumerate(keep.tolist()):
             if m in stepped:
-                kinds[row], given[row, :2] = STEPS, (self.params.step_m, stepped[m])
+                kinds[row], backward[row, :2] = STEPS, (self.params.step_m, stepped[m])
             if kinds[row] == STEPS:
-                given[row, 1] += math.pi
+                backward[row, 1] += math.pi
         mirrored = t_ns[-1] + t_ns[0] - t_ns[keep]
-        _, when, out = self._run(self.back, kinds, channels[keep], mirrored, given)
+        _, when, out = self._run(self.back, kinds, channels[keep], mirrored, backward)
         real = t_ns[-1] + t_ns[0] - when
         # the state before the message at a time: what the forward filter has there is not taken twice
-        found: dict[int, FloatArray] = {}
+        states: dict[int, FloatArray] = {}
         for k in range(1, len(real)):
             if real[k] < real[k - 1]:
-                found[int(real[k])] = out[k - 1]
-        return found
+                states[int(real[k])] = out[k - 1]
+        return states
 
     def snapshot(self) -> Any:
         """Return what was taken so far."""

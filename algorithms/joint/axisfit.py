@@ -319,15 +319,15 @@ def fit_axes(
             w.axis[i, m] = w.best[i, m]
     # The pairing whose angles agree better (eqs 73, 74) is carried to the end of the joint cost; there the two
     # are compared again, now with better axes.
-    known = False
+    decided = False
     for again in range(2):
         plus = pairing_misfit(w, rows, count, lag, 1.0)
         minus = pairing_misfit(w, rows, count, lag, -1.0)
-        known = math.isfinite(plus) and math.isfinite(minus)
-        if known and minus < plus:
+        decided = math.isfinite(plus) and math.isfinite(minus)
+        if decided and minus < plus:
             for m in range(3):
                 w.axis[1, m] = -w.axis[1, m]
-        w.pairing = max(plus, minus) / (plus + minus) if known else 0.5
+        w.pairing = max(plus, minus) / (plus + minus) if decided else 0.5
         if again == 0 and sd_acc > 0.0:
             descend_axes(w, rows, count, sd_gyr, sd_acc, gravity, 25)
     sign = 1.0 if w.axis[0, 0] * ox + w.axis[0, 1] * oy + w.axis[0, 2] * oz >= 0.0 else -1.0
@@ -336,7 +336,7 @@ def fit_axes(
             w.axis[i, m] *= sign
     w.cost = axes_cost(w, rows, count, sd_gyr, sd_acc, gravity, True)
     spread(w, rows, count)
-    return known
+    return decided
 
 
 @compiled

@@ -138,9 +138,12 @@ class JointCalibrator(Calibrator):
             if parts
             else (np.zeros((0, 24)), 0.0)
         )
-        found: dict[str, Any] = {"joint": joint, "segments": [upper, lower], "usable": False}
+        result: dict[str, Any] = {"joint": joint, "segments": [upper, lower], "usable": False}
         if len(rows) < 60:
-            return {**found, "why": f"{len(rows)} samples in common of at least 60 (do their times overlap?)"}
+            return {
+                **result,
+                "why": f"{len(rows)} samples in common of at least 60 (do their times overlap?)",
+            }
         step = max(1, math.ceil(len(rows) / MOST_ROWS))
         rows = np.ascontiguousarray(rows[::step])
         work = np.zeros(1, axisfit.WORK_DTYPE)
@@ -188,7 +191,7 @@ class JointCalibrator(Calibrator):
             why = f"the axes' signs cannot be paired ({best.pairing:.2f} of at least 0.55): axis near the vertical?"
         placed = best.position_sd < 0.05
         return {
-            **found,
+            **result,
             "usable": not why,
             "why": why,
             "axes": best.axes.tolist(),
@@ -246,7 +249,7 @@ def unbroken(
     pairs: Sequence[tuple[tuple[Any, FloatArray], tuple[Any, FloatArray]]],
 ) -> list[vectorfit.Span]:
     """Return the longest stretches of both sensors without a gap, at the upper's times; at least 3 s, at most six."""
-    found = []
+    spans = []
     for upper, lower in pairs:
         t, s = upper[0].astype(np.float64) * 1e-9, lower[0].astype(np.float64) * 1e-9
         if len(t) < 5 or len(s) < 5:
@@ -257,8 +260,8 @@ def unbroken(
         broken = np.flatnonzero((np.diff(t) > 0.1) | (good[1:] != good[:-1])) + 1
         for part in np.split(np.arange(len(t)), broken):
             if len(part) > 20 and good[part[0]] and t[part[-1]] - t[part[0]] >= 3.0:
-                found.append(vectorfit.Span(t[part] - t[part[0]], upper[1][part], other[part]))
-    return sorted(found, key=lambda span: -len(span.t))[:6]
+                spans.append(vectorfit.Span(t[part] - t[part[0]], upper[1][part], other[part]))
+    return sorted(spans, key=lambda span: -len(span.t))[:6]
 
 
 def paired_rows(upper: tuple[Any, FloatArray], lower: tuple[Any, FloatArray]) -> tuple[FloatArray, float]:

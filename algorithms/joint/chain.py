@@ -132,8 +132,8 @@ def restart(s: Any, i: int) -> None:
     ux, uy, uz = a[0] / size, a[1] / size, a[2] / size
     jx, jy, jz = s.mount[i, 0, 0], s.mount[i, 0, 1], s.mount[i, 0, 2]
     dot = ux * jx + uy * jy + uz * jz
-    known = abs(dot) < 0.9
-    if not known:  # flexion axis near the vertical: the long axis instead, forward
+    level = abs(dot) < 0.9
+    if not level:  # flexion axis near the vertical: the long axis instead, forward
         jx, jy, jz = s.mount[i, 1, 0], s.mount[i, 1, 1], s.mount[i, 1, 2]
         dot = ux * jx + uy * jy + uz * jz
     jx, jy, jz = jx - dot * ux, jy - dot * uy, jz - dot * uz
@@ -141,8 +141,8 @@ def restart(s: Any, i: int) -> None:
     jx, jy, jz = jx / size, jy / size, jz / size
     kx, ky, kz = uy * jz - uz * jy, uz * jx - ux * jz, ux * jy - uy * jx
     r = s.rot
-    first = 0 if known else 1
-    sign = 1.0 if known else -1.0
+    first = 0 if level else 1
+    sign = 1.0 if level else -1.0
     r[i, first, 0], r[i, first, 1], r[i, first, 2] = jx, jy, jz
     r[i, 1 - first, 0], r[i, 1 - first, 1], r[i, 1 - first, 2] = sign * kx, sign * ky, sign * kz
     r[i, 2, 0], r[i, 2, 1], r[i, 2, 2] = ux, uy, uz
@@ -167,7 +167,7 @@ def restart(s: Any, i: int) -> None:
         s.P[6 * i + 3 + k, 6 * i + 3 + k] = s.p_bias
         s.bias[i, k] = 0.0
     hinge = s.n > 1 and s.type[max(0, i - 1)] == HINGE
-    s.P[6 * i + 2, 6 * i + 2] = 0.02 if hinge and known else 0.3
+    s.P[6 * i + 2, 6 * i + 2] = 0.02 if hinge and level else 0.3
     s.still[i] = 0.0
     for k in range(3):
         s.low[i, k] = s.acc[i, k]

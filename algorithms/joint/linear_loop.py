@@ -32,69 +32,69 @@ def emit(s: Any, out: FloatArray) -> None:
     joints = s.n * axes
     for c in range(out.shape[0]):
         out[c] = math.nan
-    at = 0
+    column = 0
     for j in range(s.n - 1):
         a, b = j * axes + flex, (j + 1) * axes + flex
         if s.valid[j] == 1 and s.valid[j + 1] == 1:
-            out[at] = s.theta_g[j, flex] + s.x[2 * a] - s.theta_g[j + 1, flex] - s.x[2 * b]
-        at += 1
+            out[column] = s.theta_g[j, flex] + s.x[2 * a] - s.theta_g[j + 1, flex] - s.x[2 * b]
+        column += 1
     for part in range(3):  # angles, standard deviations, biases
         if part == 1:
             for j in range(s.n - 1):
                 a, b = 2 * (j * axes + flex), 2 * ((j + 1) * axes + flex)
                 if s.valid[j] == 1 and s.valid[j + 1] == 1:
-                    out[at] = math.sqrt(max(0.0, s.P[a, a] + s.P[b, b] - 2.0 * s.P[a, b]))
-                at += 1
+                    out[column] = math.sqrt(max(0.0, s.P[a, a] + s.P[b, b] - 2.0 * s.P[a, b]))
+                column += 1
         for i in range(s.n):
             for k in range(shown):
                 a = 2 * (i * axes + k)
                 if s.valid[i] == 1:
                     if part == 0:
-                        out[at] = s.theta_g[i, k] + s.x[a]
+                        out[column] = s.theta_g[i, k] + s.x[a]
                     elif part == 1:
-                        out[at] = math.sqrt(max(0.0, s.P[a, a]))
+                        out[column] = math.sqrt(max(0.0, s.P[a, a]))
                     else:
-                        out[at] = -s.x[a + 1]
-                at += 1
-    out[at] = s.jump
-    at += 1
+                        out[column] = -s.x[a + 1]
+                column += 1
+    out[column] = s.jump
+    column += 1
     for i in range(s.n):
         if s.valid[i] == 1:
-            out[at] = s.rho[i]
-        at += 1
+            out[column] = s.rho[i]
+        column += 1
     for i in range(s.n):
         used = 0
         for k in range(axes):
             used = max(used, s.use[i * axes + k])
-        out[at] = used
-        at += 1
+        out[column] = used
+        column += 1
     for j in range(s.n - 1):
-        out[at] = s.use[joints + j]
-        at += 1
+        out[column] = s.use[joints + j]
+        column += 1
     for i in range(s.n):  # gains of the flexion angles
         a = 2 * (i * axes + flex)
         for h in range(s.n):
-            out[at] = s.K[a, h * axes + flex]
-            at += 1
+            out[column] = s.K[a, h * axes + flex]
+            column += 1
         for j in range(s.n - 1):
-            out[at] = s.K[a, joints + j]
-            at += 1
+            out[column] = s.K[a, joints + j]
+            column += 1
     for i in range(s.n):
         for k in range(shown):
             a = 2 * (i * axes + k)
-            out[at] = share(s, a, i, False)
-            out[at + 1] = share(s, a, i, True)
-            at += 2
+            out[column] = share(s, a, i, False)
+            out[column + 1] = share(s, a, i, True)
+            column += 2
     if s.kind == SELF:
         if s.alpha_on == 1:
-            out[at], out[at + 1], out[at + 2] = s.alpha, s.alpha_acc, s.alpha_gyr
-            out[at + 3] = math.sqrt(s.alpha_var)
-        at += 4
+            out[column], out[column + 1], out[column + 2] = s.alpha, s.alpha_acc, s.alpha_gyr
+            out[column + 3] = math.sqrt(s.alpha_var)
+        column += 4
         for i in range(2):
             for m in range(3):
                 if s.known == 1:
-                    out[at] = s.axis[i, m]
-                at += 1
+                    out[column] = s.axis[i, m]
+                column += 1
 
 
 @compiled

@@ -249,34 +249,34 @@ class JointRelative(ChainEstimator):
             for j, name in enumerate(self.joint_names())
             if s["type"][j] == chain.FREE and not s["placed"][j]
         ]
-        found = super().remarks()
+        remarks = super().remarks()
         if blind:
-            found.append(
+            remarks.append(
                 Remark(
                     "heading_not_observable",
                     f"{', '.join(blind)}: a free joint without a position says nothing about relative heading; its "
                     "angles drift (only tilt is kept); give joint=hinge, position, or a joint calibration",
                 )
             )
-        return found
+        return remarks
 
 
 def for_joint(text: str, joint: str) -> str:
     """Return the part of ``text`` about ``joint``: ``hip=free knee=hinge`` (of both legs), or one for all."""
     if "=" not in text:
         return text.strip()
-    given = dict(part.split("=", 1) for part in text.split() if "=" in part)
-    return given.get(joint, given.get(joint.removeprefix("left_").removeprefix("right_"), ""))
+    by_joint = dict(part.split("=", 1) for part in text.split() if "=" in part)
+    return by_joint.get(joint, by_joint.get(joint.removeprefix("left_").removeprefix("right_"), ""))
 
 
 def numbers(text: str, count: int, name: str) -> FloatArray:
     """Return ``count`` numbers separated by commas or spaces."""
     try:
-        found = np.array([float(part) for part in text.replace(",", " ").split()])
+        values = np.array([float(part) for part in text.replace(",", " ").split()])
     except ValueError:
-        found = np.zeros(0)
-    if found.shape != (count,) or not np.isfinite(found).all():
+        values = np.zeros(0)
+    if values.shape != (count,) or not np.isfinite(values).all():
         raise AlgorithmError(
             f"{name} = {text!r} is not allowed; must be {count} numbers separated by commas (m)"
         )
-    return found
+    return values

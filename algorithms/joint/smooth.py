@@ -119,10 +119,10 @@ class JointSmooth(PlainEstimator):
 
     def start(self, context: Context) -> None:
         """Take the joint calibration, and the side of the leg."""
-        found = context.calibrations.get("joint")
-        if found is not None and not found.usable:
+        calibration = context.calibrations.get("joint")
+        if calibration is not None and not calibration.usable:
             raise AlgorithmError("the joint calibration says not observable; calibrate on other motion")
-        self._given = found
+        self._given = calibration
         joint = side_of(context, SEGMENTS) + joint_name(*SEGMENTS)
         self.outputs = (
             Output("joint", JOINT_STATE, (joint,)),
@@ -153,15 +153,15 @@ class JointSmooth(PlainEstimator):
                     **{c: values[:, k] for k, c in enumerate(IMU_COLUMNS)},
                 }
             )
-        found = self._given
-        if found is None or not found.values.get("hinges"):
+        calibration = self._given
+        if calibration is None or not calibration.values.get("hinges"):
             params = {f: getattr(self.params, f) for f in JointCalibrationParams.__struct_fields__}
             calibrator = JointCalibrator(JointCalibrationParams(**{**params, "method": "hinge"}))
-            found = calibrator.calibrate([Stretch({}, {s: (t,) for s, t in tables.items()})])
-        if not found.usable:
-            self._remarks = [Remark("not_observable", "; ".join(found.remarks), fatal=True)]
+            calibration = calibrator.calibrate([Stretch({}, {s: (t,) for s, t in tables.items()})])
+        if not calibration.usable:
+            self._remarks = [Remark("not_observable", "; ".join(calibration.remarks), fatal=True)]
             return []
-        hinge = next(h for h in found.values["hinges"] if tuple(h["segments"]) == SEGMENTS)
+        hinge = next(h for h in calibration.values["hinges"] if tuple(h["segments"]) == SEGMENTS)
         sd = hinge["axes_sd_deg"]
         self._remarks = [
             Remark("axis_found", f"hinge axes of the whole recording ± {sd[0]:.1f}° and {sd[1]:.1f}°")
@@ -178,12 +178,12 @@ class JointSmooth(PlainEstimator):
         s = (s_ns - t_ns[0]) * 1e-9
         t = (t_ns - t_ns[0]) * 1e-9
         k = np.clip(np.searchsorted(s, t), 1, len(s) - 1)
-        known = (t >= s[0]) & (t <= s[-1]) & (s[k] - s[k - 1] <= GAP_S)
+        covered = (t >= s[0]) & (t <= s[-1]) & (s[k] - s[k - 1] <= GAP_S)
         both = np.hstack([own, np.stack([np.interp(t, s, v) for v in other.T], axis=1)])
         results: list[Result] = []
-        broken = np.flatnonzero((np.diff(t) > GAP_S) | (known[1:] != known[:-1])) + 1
+        broken = np.flatnonzero((np.diff(t) > GAP_S) | (covered[1:] != covered[:-1])) + 1
         for part in np.split(np.arange(len(t)), broken):
-            if len(part) >= 10 and known[part[0]]:
+            if len(part) >= 10 and covered[part[0]]:
                 results += self._stretch(t_ns[part], t[part], both[part], hinge)
         return results
 
@@ -221,8 +221,8 @@ class JointSmooth(PlainEstimator):
         spread = np.sqrt(np.maximum(0.0, out[:, 1]))
         return [
             result
-            for at, a, b in zip(t_ns.tolist(), angle.tolist(), spread.tolist(), strict=True)
-            for result in (Result("joint", at, (a,)), Result("sigma", at, (b,)))
+            for time_ns, a, b in zip(t_ns.tolist(), angle.tolist(), spread.tolist(), strict=True)
+            for result in (Result("joint", time_ns, (a,)), Result("sigma", time_ns, (b,)))
         ]
 
     def remarks(self) -> list[Remark]:

@@ -211,10 +211,10 @@ class SourceFilter(JointEstimator):
 
     def remarks(self) -> list[Remark]:
         """Say how often no accelerometer was usable, and what the encoder did."""
-        found = super().remarks()
+        remarks = super().remarks()
         s = self.state[0]
         if s["steps"] and s["blind"] > 0.5 * s["steps"]:
-            found.append(
+            remarks.append(
                 Remark(
                     "no_accelerometer",
                     f"no accelerometer was usable in {int(s['blind'])} of {int(s['steps'])} steps; "
@@ -222,13 +222,13 @@ class SourceFilter(JointEstimator):
                 )
             )
         if s["jumped_turns"]:
-            found.append(
+            remarks.append(
                 Remark(
                     "encoder_turns",
                     f"{int(s['jumped_turns'])} encoder values were off by whole turns and were moved by them",
                 )
             )
-        return found
+        return remarks
 
 
 def outputs_of(estimator: SourceFilter) -> tuple[Output, ...]:
@@ -238,9 +238,9 @@ def outputs_of(estimator: SourceFilter) -> tuple[Output, ...]:
     shown = AXES[: 3 if yaw else 2] if estimator.axes == 3 else (estimator.params.flexion,)
     angles = tuple(f"{s}_{a}" for s in segments for a in shown)
     note = (("yaw", "acc-tilt: no heading"),) if yaw else ()
-    found = [Output("joint", JOINT_STATE, joints)] if joints else []
-    found.append(Output("attitude", NAMED, angles, metadata=(("unit", "rad"), *note)))
-    found += [
+    outputs = [Output("joint", JOINT_STATE, joints)] if joints else []
+    outputs.append(Output("attitude", NAMED, angles, metadata=(("unit", "rad"), *note)))
+    outputs += [
         Output("sigma", NAMED, (*joints, *angles), metadata=(("unit", "rad"),)),
         Output("bias", NAMED, angles, metadata=(("unit", "rad/s"),)),
         Output(
@@ -255,13 +255,13 @@ def outputs_of(estimator: SourceFilter) -> tuple[Output, ...]:
     ]
     if estimator.kind == linear.SELF:
         pair = segments[:2]
-        found += [
+        outputs += [
             Output(
                 "alpha", NAMED, ("angle", "accelerometers", "gyroscopes", "sd"), metadata=(("unit", "rad"),)
             ),
             Output("axes", NAMED, tuple(f"{s}_{a}" for s in pair for a in "xyz")),
         ]
-    return tuple(found)
+    return tuple(outputs)
 
 
 class JointFkc(SourceFilter):

@@ -79,7 +79,7 @@ def thinned(spans: Sequence[Span]) -> list[Span]:
     """Return the liveliest :data:`MOST_S` of the spans, thinned to about :data:`RATE_HZ`."""
     from scipy.signal import butter, sosfiltfilt
 
-    found, left = [], MOST_S
+    kept, left = [], MOST_S
     for span in spans:
         step = float(np.median(np.diff(span.t)))
         rows = min(len(span.t), round(left / step))
@@ -94,8 +94,8 @@ def thinned(spans: Sequence[Span]) -> list[Span]:
         if every > 1:
             both = sosfiltfilt(butter(4, 0.8 / every, output="sos"), both, axis=0)[::every]
             t = t[::every]
-        found.append(Span(t, both[:, :6], both[:, 6:]))
-    return found
+        kept.append(Span(t, both[:, :6], both[:, 6:]))
+    return kept
 
 
 class _Problem:
@@ -143,10 +143,10 @@ class _Problem:
                 across.append(g @ b[i])
             c, s = np.cos(alpha), np.sin(alpha)
             both = np.empty((len(dt), 5))
-            for at, pair, scale in ((0, across, self.sd_gyr), (2, force, self.sd_acc)):
+            for column, pair, scale in ((0, across, self.sd_gyr), (2, force, self.sd_acc)):
                 u, v = pair
-                both[:, at] = (u[:, 0] - c * v[:, 0] - s * v[:, 1]) / scale
-                both[:, at + 1] = (u[:, 1] + s * v[:, 0] - c * v[:, 1]) / scale
+                both[:, column] = (u[:, 0] - c * v[:, 0] - s * v[:, 1]) / scale
+                both[:, column + 1] = (u[:, 1] + s * v[:, 0] - c * v[:, 1]) / scale
             both[:, 4] = (force[0][:, 2] - force[1][:, 2]) / self.sd_acc
             out.append(sosfiltfilt(sos, both, axis=0)[some].ravel())
         priors = [p[GYR:ACC] / SD_GYR_BIAS, p[ACC:POS] / SD_ACC_BIAS, p[POS:FIRST] / SD_POSITION]
@@ -166,12 +166,12 @@ class _Problem:
                 costs.append(np.sum(np.minimum(self.misfit(p, bases) ** 2, 9.0)))
             p[FIRST + k] = grid[int(np.argmin(costs))]
         scale = np.r_[[0.05] * 4, [0.005] * 6, [0.05] * 6, [0.1] * 6, [0.1] * len(self.parts)]
-        found = least_squares(self.misfit, p, args=(bases,), loss="huber", x_scale=scale, max_nfev=most)
-        normal = found.jac.T @ found.jac
-        spread = max(1.0, 2.0 * float(found.cost) / max(1, len(found.fun)))
+        solution = least_squares(self.misfit, p, args=(bases,), loss="huber", x_scale=scale, max_nfev=most)
+        normal = solution.jac.T @ solution.jac
+        spread = max(1.0, 2.0 * float(solution.cost) / max(1, len(solution.fun)))
         cov = spread * np.linalg.pinv(normal)
-        x = np.asarray(found.x)
-        return float(found.cost), [moved(bases[i], x[2 * i], x[2 * i + 1]) for i in (0, 1)], x, cov
+        x = np.asarray(solution.x)
+        return float(solution.cost), [moved(bases[i], x[2 * i], x[2 * i + 1]) for i in (0, 1)], x, cov
 
 
 def fit(spans: Sequence[Span], axes: FloatArray, band_hz: float, sd_gyr: float, sd_acc: float) -> Hinge:
@@ -190,20 +190,20 @@ def fit(spans: Sequence[Span], axes: FloatArray, band_hz: float, sd_gyr: float, 
     """
     problem = _Problem(spans, band_hz, sd_gyr, sd_acc)
     tries = [problem.solve(np.array([axes[0], sign * axes[1]]), 6) for sign in (1.0, -1.0)]
-    tries.sort(key=lambda found: found[0])
+    tries.sort(key=lambda attempt: attempt[0])
     pairing = tries[1][0] / (tries[1][0] + tries[0][0])
     _, bases, p, cov = problem.solve(np.array([b[:, 2] for b in tries[0][1]]), 15)
     sign = 1.0 if bases[0][:, 2] @ axes[0] >= 0.0 else -1.0
-    found = np.array([sign * b[:, 2] for b in bases])
+    best_axes = np.array([sign * b[:, 2] for b in bases])
     positions = p[POS:FIRST].reshape(2, 3)
-    positions = positions - found * 0.5 * float(np.sum(positions * found))
+    positions = positions - best_axes * 0.5 * float(np.sum(positions * best_axes))
     axes_cov = np.array(
         [bases[i][:, :2] @ cov[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] @ bases[i][:, :2].T for i in (0, 1)]
     )
-    across = [np.eye(3) - np.outer(a, a) for a in found]
+    across = [np.eye(3) - np.outer(a, a) for a in best_axes]
     spread = [across[i] @ cov[POS + 3 * i : POS + 3 * i + 3, POS + 3 * i : POS + 3 * i + 3] for i in (0, 1)]
     return Hinge(
-        axes=found,
+        axes=best_axes,
         positions=positions,
         axes_cov=axes_cov,
         axes_sd=np.sqrt(np.trace(axes_cov, axis1=1, axis2=2)),

@@ -136,11 +136,11 @@ def heading_of(s: Any, start_ns: int, end_ns: int) -> float:
     if last <= first:
         return math.nan
     _shaken(s, first, last)
-    at = first
+    start = first
     if s.mode == AUTO or s.mode == WALKING or s.mode == DEVICE:
-        at = max(ring.first_after(s, start_ns - (end_ns - start_ns)), s.taken - RING, 0)
+        start = max(ring.first_after(s, start_ns - (end_ns - start_ns)), s.taken - RING, 0)
     c, w = 0.0, 0.0
-    for k in range(at, last):
+    for k in range(start, last):
         yaw = s.ring[k % RING, YAW]
         c += math.cos(yaw)
         w += math.sin(yaw)

@@ -141,8 +141,8 @@ def declination(lat_deg: float, lon_deg: float, alt_m: float, t_ns: int) -> floa
     """Return the magnetic declination (rad, east positive) by the World Magnetic Model of the date."""
     year = 2025.0
     if t_ns >= NO_EPOCH_NS:
-        at = datetime.fromtimestamp(t_ns / 1e9, UTC)
-        year = at.year + (at.timetuple().tm_yday - 1) / 365.25
+        moment = datetime.fromtimestamp(t_ns / 1e9, UTC)
+        year = moment.year + (moment.timetuple().tm_yday - 1) / 365.25
     alt = round(alt_m, -2) if math.isfinite(alt_m) else 0.0
     return _declination(round(lat_deg, 1), round(lon_deg, 1), alt, round(year, 1))
 
@@ -152,10 +152,10 @@ def _declination(lat_deg: float, lon_deg: float, alt_m: float, year: float) -> f
     """Cells of 0.1° and 0.1 year: within 0.05° of the model away from the magnetic poles."""
     epoch = 2025 if year >= 2025 else 2020 if year >= 2020 else 2015
     name = "wmm/WMM_2015v2.COF" if epoch == 2015 else f"wmm/WMM_{epoch}.COF"
-    found = _model(name).calculate(
+    field = _model(name).calculate(
         glat=lat_deg, glon=lon_deg, alt=alt_m / 1000, time=year, allow_date_outside_lifespan=True
     )
-    return math.radians(found.d)
+    return math.radians(field.d)
 
 
 @lru_cache(maxsize=3)

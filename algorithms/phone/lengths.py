@@ -155,6 +155,6 @@ def fit_lengths(
             f"length model {model}: {len(walks)} walks do not determine its {rows.shape[-1]} constants; "
             "give walks of different pace and known length"
         )
-    found = np.linalg.lstsq(rows / scale, distances, rcond=None)[0] / scale
+    coefficients = np.linalg.lstsq(rows / scale, distances, rcond=None)[0] / scale
     names = ("length_alpha", "length_beta", "length_gamma") if model == "linear" else ("length_k",)
-    return dict(zip(names, found.tolist(), strict=True))
+    return dict(zip(names, coefficients.tolist(), strict=True))

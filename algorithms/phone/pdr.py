@@ -215,8 +215,8 @@ class PhoneTrack(KernelEstimator):
         )
         whose, when = np.zeros(self.max_results, np.int64), np.zeros(self.max_results, np.int64)
         out = np.full((self.max_results, self.width), np.nan)
-        at = np.array([index]), np.array([0]), np.array([message.t_ns], np.int64)
-        count = self.run(self.state, *at, values, whose, when, out)
+        place = np.array([index]), np.array([0]), np.array([message.t_ns], np.int64)
+        count = self.run(self.state, *place, values, whose, when, out)
         return self.results(when[:count], out[:count])
 
     def encode(self, index: int, channel: int, table: pl.DataFrame) -> FloatArray:
@@ -228,9 +228,9 @@ class PhoneTrack(KernelEstimator):
     def remarks(self) -> list[Remark]:
         """Say what a user must know."""
         s = self.state[0]
-        found = steps.step_remarks(s)
+        remarks = steps.step_remarks(s)
         if s["mode"] == direction.MAGNETOMETER and s["steps"] and s["tilted"] > 0.5 * s["steps"]:
-            found.append(
+            remarks.append(
                 Remark(
                     "not_level",
                     f"at {int(s['tilted'])} of {int(s['steps'])} steps the screen did not look up: eq 3.17 has no "
@@ -239,37 +239,37 @@ class PhoneTrack(KernelEstimator):
                 )
             )
         if s["has_gyr"] and s["gyr_ns"] == 0:
-            found.append(Remark("no_gyroscope", "no sample of the gyroscope arrived: headings stand still"))
+            remarks.append(Remark("no_gyroscope", "no sample of the gyroscope arrived: headings stand still"))
         if not s["has_mag"] and not self.fused:
-            found.append(
+            remarks.append(
                 Remark("heading_relative", "no magnetometer is used: x is the direction of the first step")
             )
         elif s["tau_mag"] > 1e4 and not self.fused and s["mode"] < direction.MAGNETOMETER:
-            found.append(
+            remarks.append(
                 Remark(
                     "mag_uncalibrated",
                     "the magnetometer is not calibrated: north is what it showed before the first step",
                 )
             )
         if not np.isfinite(s["mean"]).all():
-            found.append(Remark("diverged", "the track is not finite", fatal=True))
+            remarks.append(Remark("diverged", "the track is not finite", fatal=True))
         if self.fused:
             if s["fixes"] == 0:
-                found.append(
+                remarks.append(
                     Remark("no_fixes", "no fix arrived: the track has no place on the Earth", fatal=True)
                 )
             if s["relocated"]:
-                found.append(
+                remarks.append(
                     Remark(
                         "relocated",
                         f"{int(s['relocated'])} times ten fixes in a row lay off: begun anew there",
                     )
                 )
             if s["lost_fixes"]:
-                found.append(
+                remarks.append(
                     Remark("lost_fixes", f"{int(s['lost_fixes'])} fixes came too fast and are left out")
                 )
-        return found
+        return remarks
 
 
 def drift_sd(p: PdrParams, rate_hz: float) -> float:

@@ -126,12 +126,12 @@ def _pass(
 
 
 def _model(
-    move: FloatArray, dt: float, at: FloatArray, slow: float, p: PhoneFusedParams
+    move: FloatArray, dt: float, state: FloatArray, slow: float, p: PhoneFusedParams
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return Jacobian, noise and value of the motion to the next event, linearized at ``at``."""
     F, Q = np.eye(N), np.zeros((N, N))
-    heading = move[1] + at[2] + at[6] * dt
-    c, w, r = math.cos(heading), math.sin(heading), move[0] * math.exp(at[3])
+    heading = move[1] + state[2] + state[6] * dt
+    c, w, r = math.cos(heading), math.sin(heading), move[0] * math.exp(state[3])
     F[0, 2], F[1, 2] = -r * w, r * c
     F[0, 6], F[1, 6] = -r * w * dt, r * c * dt
     F[0, 3], F[1, 3] = r * c, r * w
@@ -145,10 +145,10 @@ def _model(
         Q[2, 2], Q[3, 3] = math.radians(p.sigma_turn_deg) ** 2, 0.003**2
     Q[4, 4] = Q[5, 5] = slow**2 * (1 - keep * keep)
     Q[6, 6] = dt * 2e-5**2
-    value = at.copy()
+    value = state.copy()
     value[0] += r * c
     value[1] += r * w
-    value[2] += at[6] * dt
+    value[2] += state[6] * dt
     value[4:6] *= keep
     return F, Q, value
 
@@ -252,8 +252,8 @@ class PhoneSmooth(PlainEstimator):
                 good = np.isfinite(encoded[:, 0]) & np.isfinite(encoded[:, 1])
                 fixes, fix_times = encoded[good], times[mine][good]
         self._messages = []
-        found = self._run(index, times, values)
-        return self._smoothed(found, fixes, fix_times)
+        outputs = self._run(index, times, values)
+        return self._smoothed(outputs, fixes, fix_times)
 
     def _run(self, index: IntArray, times: IntArray, values: FloatArray) -> dict[str, list[tuple[int, Any]]]:
         """Run the forward pass; return its results by output."""
@@ -273,14 +273,14 @@ class PhoneSmooth(PlainEstimator):
         return out
 
     def _smoothed(
-        self, found: dict[str, list[tuple[int, Any]]], fixes: FloatArray, fix_times: IntArray
+        self, outputs: dict[str, list[tuple[int, Any]]], fixes: FloatArray, fix_times: IntArray
     ) -> list[Result]:
         p, s = self.params, self._forward.state[0]
         if not len(fixes):
             self._failed = "no fix arrived"
             return []
-        state = dict(found["state"])
-        steps = [(t, v, state[t]) for t, v in found["step"] if t in state]
+        state = dict(outputs["state"])
+        steps = [(t, v, state[t]) for t, v in outputs["step"] if t in state]
         ends = np.array([t for t, _, _ in steps], np.int64)
         starts = ends - np.array([round(v[0] * 1e9) for _, v, _ in steps], np.int64)
         length = np.array([v[2] / c[1] for _, v, c in steps])
@@ -305,7 +305,7 @@ class PhoneSmooth(PlainEstimator):
         if not np.isfinite(done.state).all():
             self._failed = "the smoother diverged"
             return []
-        return self._results(t_ns, done, steps, heading, length, dict(found["pose"]))
+        return self._results(t_ns, done, steps, heading, length, dict(outputs["pose"]))
 
     def _results(
         self,
@@ -344,7 +344,7 @@ class PhoneSmooth(PlainEstimator):
 
     def remarks(self) -> list[Remark]:
         """Say what a user must know; among it what the forward pass says."""
-        found = self._forward.remarks()
+        remarks = self._forward.remarks()
         if self._failed:
-            found.append(Remark("not_smoothed", self._failed, fatal=True))
-        return found
+            remarks.append(Remark("not_smoothed", self._failed, fatal=True))
+        return remarks

@@ -101,15 +101,15 @@ def source_steps(
     peaks, valleys = extremes(norm, half)
     peaks, valleys = peaks[norm[peaks] > upper[peaks]], valleys[norm[valleys] < lower[valleys]]
     peaks, valleys = peaks[thin(t_s[peaks], so_far)], valleys[thin(t_s[valleys], so_far)]
-    found: list[int] = []
+    steps: list[int] = []
     waiting = -1
     for place, is_peak in sorted([(int(p), True) for p in peaks] + [(int(v), False) for v in valleys]):
         if is_peak and waiting < 0:
             waiting = place
         elif not is_peak and waiting >= 0:
-            found.append(waiting)
+            steps.append(waiting)
             waiting = -1
-    return np.array(found, np.int64)
+    return np.array(steps, np.int64)
 
 
 def source_headings(mag: FloatArray, window: int = 20, *, centred: bool = True) -> FloatArray:

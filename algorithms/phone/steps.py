@@ -174,12 +174,12 @@ def shift_queue(s: Any, n: int) -> None:
 
 
 @compiled
-def _give(s: Any, limit: int, at: int, out_message: Any, out_t_ns: Any, out: Any, count: int) -> int:
+def _give(s: Any, limit: int, cause: int, out_message: Any, out_t_ns: Any, out: Any, count: int) -> int:
     n = min(s.queued, limit)
     for k in range(n):
         start, end = s.queue_start[k], s.queue_end[k]
         ring.features(s, start, end, s.gravity, s.features)
-        out_message[count], out_t_ns[count] = at, end
+        out_message[count], out_t_ns[count] = cause, end
         out[count, 0], out[count, 1] = (end - start) * 1e-9, s.steps
         for j in range(2, 5):
             out[count, j] = np.nan
@@ -251,13 +251,15 @@ class PhoneSteps(KernelEstimator):
 
 def step_remarks(s: Any) -> list[Remark]:
     """Return what a user must know about the steps of record ``s``."""
-    found: list[Remark] = []
+    remarks: list[Remark] = []
     if s["taken"] == 0:
-        found.append(Remark("no_samples", "no sample of the accelerometer arrived", fatal=True))
+        remarks.append(Remark("no_samples", "no sample of the accelerometer arrived", fatal=True))
     elif s["steps"] == 0:
-        found.append(
+        remarks.append(
             Remark("no_steps", "no step was found: nobody walked, or the method does not suit the placement")
         )
     if s["dropped"]:
-        found.append(Remark("dropped_steps", f"{int(s['dropped'])} steps at once were too many and are lost"))
-    return found
+        remarks.append(
+            Remark("dropped_steps", f"{int(s['dropped'])} steps at once were too many and are lost")
+        )
+    return remarks

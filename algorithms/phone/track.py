@@ -138,10 +138,10 @@ def _open_step(s: Any) -> None:
 
 
 @compiled
-def _write_track(s: Any, t_ns: int, at: int, out_message: Any, out_t_ns: Any, out: Any, k: int) -> None:
+def _write_track(s: Any, t_ns: int, cause: int, out_message: Any, out_t_ns: Any, out: Any, k: int) -> None:
     for j in range(out.shape[1]):
         out[k, j] = np.nan
-    out_message[k], out_t_ns[k] = at, t_ns
+    out_message[k], out_t_ns[k] = cause, t_ns
     heading = attitude.wrap(s.part_heading + s.mean[2])
     s.heading = heading
     out[k, O_POSE], out[k, O_POSE + 1], out[k, O_POSE + 2] = s.mean[0], s.mean[1], s.height
@@ -165,12 +165,12 @@ def _write_track(s: Any, t_ns: int, at: int, out_message: Any, out_t_ns: Any, ou
 
 
 @compiled
-def _close_step(s: Any, at: int, out_message: Any, out_t_ns: Any, out: Any, k: int) -> None:
+def _close_step(s: Any, cause: int, out_message: Any, out_t_ns: Any, out: Any, k: int) -> None:
     start, end = s.queue_start[0], s.queue_end[0]
     mixture.step(s, end, s.part_length, s.part_heading, 1.0 - s.part)
     length = s.part_length * math.exp(s.mean[3])
     s.distance += length
-    _write_track(s, end, at, out_message, out_t_ns, out, k)
+    _write_track(s, end, cause, out_message, out_t_ns, out, k)
     out[k, O_STEP], out[k, O_STEP + 1], out[k, O_STEP + 2] = (end - start) * 1e-9, s.steps, length
     out[k, O_STEP + 3] = s.height - s.height_step if s.pressure_n > 0 else np.nan
     out[k, O_STEP + 4] = s.heading
@@ -247,7 +247,7 @@ def drain(
     s: Any,
     now_ns: int,
     all_of_it: bool,
-    at: int,
+    cause: int,
     out_message: Any,
     out_t_ns: Any,
     out: Any,
@@ -268,7 +268,7 @@ def drain(
                     s.part = share
             else:
                 if s.part < 1.0:
-                    _close_step(s, at, out_message, out_t_ns, out, count)
+                    _close_step(s, cause, out_message, out_t_ns, out, count)
                 else:
                     s.part = 1.0 - 1e-9
                     continue
@@ -283,7 +283,7 @@ def drain(
             break
         t = s.wait_ns[0]
         _use_fix(s, t)
-        _write_track(s, t, at, out_message, out_t_ns, out, count)
+        _write_track(s, t, cause, out_message, out_t_ns, out, count)
         count, capacity = count + 1, capacity - 1
     return count
 

@@ -139,27 +139,27 @@ class PhoneTransform(PlainEstimator):
             weights = 1 / seen[:, 3] ** 2
         target = np.column_stack((grid.east_m, grid.north_m))
         try:
-            found = horn(pairs, target, scale=self.params.scale, weights=weights)
+            fitted = horn(pairs, target, scale=self.params.scale, weights=weights)
         except AlgorithmError as error:
             self.failed = str(error)
             return []
         quats = np.array([v[3:] for _, v in poses], dtype=np.float64)
         alt = float(np.nanmean(seen[:, 2])) if np.isfinite(seen[:, 2]).any() else math.nan
-        return self._results(t, found.apply(local), quats, found, grid, len(when), alt)
+        return self._results(t, fitted.apply(local), quats, fitted, grid, len(when), alt)
 
     def _results(
-        self, t: Any, place: Any, quats: Any, found: Any, grid: geodesy.Grid, pairs: int, alt: float
+        self, t: Any, place: Any, quats: Any, fitted: Any, grid: geodesy.Grid, pairs: int, alt: float
     ) -> list[Result]:
         lat, lon = geodesy.from_utm(grid.zone, grid.south, place[:, 0], place[:, 1])
-        sd, origin = found.rms / math.sqrt(2), np.array([grid.east_m[0], grid.north_m[0]])
-        turn = math.atan2(found.rotation[1, 0], found.rotation[0, 0])
+        sd, origin = fitted.rms / math.sqrt(2), np.array([grid.east_m[0], grid.north_m[0]])
+        turn = math.atan2(fitted.rotation[1, 0], fitted.rotation[0, 0])
         convergence, scale = float(grid.convergence_rad[0]), float(grid.scale[0])
         north_error = math.remainder(turn - convergence, 2 * math.pi)
         about = (
             turn,
-            found.scale,
-            *found.shift.tolist(),
-            found.rms,
+            fitted.scale,
+            *fitted.shift.tolist(),
+            fitted.rms,
             pairs,
             grid.zone,
             convergence,

@@ -199,15 +199,15 @@ def _fit_accelerometer(
             return np.linalg.norm((force - b) @ m.T, axis=1) - gravity
 
         start = np.concatenate((np.ones(3), np.zeros(unknowns - 3)))
-        found = least_squares(
+        solution = least_squares(
             residual, start, x_scale=np.concatenate((np.ones(3), np.full(unknowns - 3, 0.1)))
         )
-        normal = found.jac.T @ found.jac
-        if np.linalg.cond(found.jac) > 1e4:
+        normal = solution.jac.T @ solution.jac
+        if np.linalg.cond(solution.jac) > 1e4:
             continue
-        noise = max(float(np.sum(found.fun**2)) / max(1, len(force) - unknowns), least_variance)
+        noise = max(float(np.sum(solution.fun**2)) / max(1, len(force) - unknowns), least_variance)
         spread = np.linalg.inv(normal) * noise
-        m, b = model(found.x)
+        m, b = model(solution.x)
         if np.abs(m - np.eye(3)).max() > 0.3 or np.abs(b).max() > 3.0:
             continue  # far beyond any sensor: the positions do not determine it
         return m, b, spread[3:6, 3:6], skewed
@@ -234,11 +234,11 @@ def _fit_gyroscope(
             parts.append(turned - direction[i + 1])
         return np.concatenate(parts)
 
-    found = least_squares(residual, np.zeros(9), x_scale=0.05)
-    if np.linalg.cond(found.jac) > 1e3 or np.abs(found.x).max() > 0.3:
+    solution = least_squares(residual, np.zeros(9), x_scale=0.05)
+    if np.linalg.cond(solution.jac) > 1e3 or np.abs(solution.x).max() > 0.3:
         return None
-    error = np.degrees(np.linalg.norm(found.fun.reshape(-1, 3), axis=1))
-    return np.eye(3) + found.x.reshape(3, 3), float(np.sqrt(np.mean(error**2)))
+    error = np.degrees(np.linalg.norm(solution.fun.reshape(-1, 3), axis=1))
+    return np.eye(3) + solution.x.reshape(3, 3), float(np.sqrt(np.mean(error**2)))
 
 
 @compiled

@@ -131,9 +131,9 @@ def fit_sphere(field: FloatArray, soft_iron: bool) -> tuple[FloatArray, FloatArr
     )
     plain = least_squares(residual, start)
     scale = max(1.4826 * float(np.median(np.abs(plain.fun))), 1e-9)
-    found = least_squares(residual, plain.x, loss="huber", f_scale=1.345 * scale)
-    centre, matrix = parts(found.x)
-    return middle + size * centre, matrix / size, residual(found.x), found.jac / size
+    solution = least_squares(residual, plain.x, loss="huber", f_scale=1.345 * scale)
+    centre, matrix = parts(solution.x)
+    return middle + size * centre, matrix / size, residual(solution.x), solution.jac / size
 
 
 def _algebraic_centre(points: FloatArray) -> FloatArray:

@@ -149,14 +149,14 @@ def read(path: Path, data: bytes) -> list[Label]:
         raise MarchaError(f"{path}: counts time in {header.get('TIME_UNITS')!r}; save it in milliseconds")
     slots = {k: v * unit for k, v in _slots(path, root).items()}
     spans: dict[str, tuple[int, int]] = {}
-    found: list[tuple[str, str, str, str | None]] = []
+    entries: list[tuple[str, str, str, str | None]] = []
     referring: dict[str, list[tuple[str, str]]] = {}
     for tier in root.iter("TIER"):
         tier_name, who = tier.get("TIER_ID", ""), tier.get("ANNOTATOR") or None
         for holder in tier.iter("ANNOTATION"):
             for entry in holder:
                 number = entry.get("ANNOTATION_ID", "")
-                found.append((tier_name, number, entry.findtext("ANNOTATION_VALUE") or "", who))
+                entries.append((tier_name, number, entry.findtext("ANNOTATION_VALUE") or "", who))
                 if entry.tag == "ALIGNABLE_ANNOTATION":
                     try:
                         first, last = (slots[entry.get(f"TIME_SLOT_REF{k}", "")] for k in (1, 2))
@@ -174,8 +174,8 @@ def read(path: Path, data: bytes) -> list[Label]:
                 else:
                     referring.setdefault(tier_name, []).append((number, entry.get("ANNOTATION_REF", "")))
     _refer(path, spans, referring.values())
-    order = sorted(range(len(found)), key=lambda k: (spans[found[k][1]][0], k))
-    return [Label(found[k][0], *spans[found[k][1]], found[k][2], {}, found[k][3]) for k in order]
+    order = sorted(range(len(entries)), key=lambda k: (spans[entries[k][1]][0], k))
+    return [Label(entries[k][0], *spans[entries[k][1]], entries[k][2], {}, entries[k][3]) for k in order]
 
 
 def _slots(path: Path, root: ElementTree.Element) -> dict[str, int]:
@@ -190,14 +190,17 @@ def _slots(path: Path, root: ElementTree.Element) -> dict[str, int]:
             )
         names.append(slot.get("TIME_SLOT_ID", ""))
         values.append(None if value is None else int(value))
-    known = [k for k, v in enumerate(values) if v is not None]
+    stated = [k for k, v in enumerate(values) if v is not None]
     out = {}
-    at = 0
+    next_stated = 0
     for k, value in enumerate(values):
         if value is None:
-            while at < len(known) and known[at] < k:
-                at += 1
-            before, after = (known[at - 1] if at else None), (known[at] if at < len(known) else None)
+            while next_stated < len(stated) and stated[next_stated] < k:
+                next_stated += 1
+            before, after = (
+                (stated[next_stated - 1] if next_stated else None),
+                (stated[next_stated] if next_stated < len(stated) else None),
+            )
             if before is None or after is None:
                 raise MarchaError(f"{path}: time slot {names[k]!r} has no time and none on both sides of it")
             low, high = values[before] or 0, values[after] or 0

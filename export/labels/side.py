@@ -85,16 +85,16 @@ def annotations_of(
         Tier of labels that have none.
     """
     side = _read_side(side_path(path))
-    known: dict[tuple[str, int, int], list[tuple[str, list[Any]]]] = {}
+    rows_of: dict[tuple[str, int, int], list[tuple[str, list[Any]]]] = {}
     tiers: dict[str, str] = {}
     if side is not None:
         for key, values in zip(side.labels, side.annotations, strict=True):
-            known.setdefault((key[0], key[1], key[2]), []).append((key[3], values))
+            rows_of.setdefault((key[0], key[1], key[2]), []).append((key[3], values))
             tiers.setdefault(key[0] or f"[{values[0]}]", values[0])
     default = tier or path.name.split(".")[0]
     rows, changed = [], 0
     for label in labels:
-        same = _taken(known.get(label[:3], []), label.text)
+        same = _taken(rows_of.get(label[:3], []), label.text)
         if same is not None:
             rows.append(same)
         elif not label.filler:
@@ -123,8 +123,8 @@ def _taken(options: list[tuple[str, list[Any]]], text: str) -> list[Any] | None:
     which tools rewrite when they save.
     """
     for alike in (str, _one_kind_of_breaks):
-        for place, (known, values) in enumerate(options):
-            if alike(known) == alike(text):
+        for place, (label, values) in enumerate(options):
+            if alike(label) == alike(text):
                 del options[place]
                 return values
     return None
@@ -181,14 +181,14 @@ def lane_names(pairs: Iterable[tuple[str, Any]], word: str = "") -> dict[tuple[s
     """Return a tier's name in the file for each (tier, lane), no two alike: ``tier``, ``tier [2]``, …"""
     distinct = list(dict.fromkeys(pairs))
     taken = {tier for tier, _ in distinct}
-    given: set[str] = set()
+    chosen: set[str] = set()
     names = {}
     for tier, lane in distinct:
         name, number = tier, 1
-        while name in given or (number > 1 and name in taken):
+        while name in chosen or (number > 1 and name in taken):
             number += 1
             name = f"{tier} [{number}]"
-        given.add(name)
+        chosen.add(name)
         names[tier, lane] = name
     return names
 

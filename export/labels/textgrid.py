@@ -31,8 +31,8 @@ def limits(rows: pl.DataFrame) -> list[str]:
 def _lanes(rows: pl.DataFrame) -> list[tuple[bool, int]]:
     """Return whether each annotation is a point, and its lane."""
     times = rows.select("tier", "start_ns", "end_ns").rows()
-    found = lanes((f"{a == b} {tier}", a, max(b, a + 1)) for tier, a, b in times)
-    return [(a == b, lane) for (_, a, b), lane in zip(times, found, strict=True)]
+    levels = lanes((f"{a == b} {tier}", a, max(b, a + 1)) for tier, a, b in times)
+    return [(a == b, lane) for (_, a, b), lane in zip(times, levels, strict=True)]
 
 
 def labels(rows: pl.DataFrame, origin_ns: int) -> list[Label]:
@@ -81,14 +81,14 @@ def text(placed: list[Label], end_ns: int) -> str:
 
 def _filled(members: list[Label], end_ns: int) -> list[Label]:
     """Return the intervals of a tier with nothing in between: Praat wants no gaps."""
-    out, at = [], 0
+    out, until_ns = [], 0
     for label in members:
-        if label.start_ns > at:
-            out.append(Label(label.tier, at, label.start_ns, ""))
+        if label.start_ns > until_ns:
+            out.append(Label(label.tier, until_ns, label.start_ns, ""))
         out.append(label)
-        at = label.end_ns
-    if at < end_ns:
-        out.append(Label(members[0].tier, at, end_ns, ""))
+        until_ns = label.end_ns
+    if until_ns < end_ns:
+        out.append(Label(members[0].tier, until_ns, end_ns, ""))
     return out
 
 

@@ -168,11 +168,11 @@ def _contacts(frames: Iterator[pl.DataFrame], report: ReportBuilder) -> Iterator
     feet = rows.select("left", "right").to_numpy()
     down = np.zeros_like(feet, dtype=bool)
     down[1:] = (feet[1:] == 1) & (feet[:-1] == 0)
-    at, _ = np.nonzero(down)
+    rows_down, _ = np.nonzero(down)
     report.note(
         "contacts",
         f"{down[:, 0].sum()} contacts of the one foot and {down[:, 1].sum()} of the other in {rows.height} rows",
         count=int(down.sum()),
     )
-    report.keep(rows.height - len(at))
-    yield rows[at.tolist()].select("t", "line")
+    report.keep(rows.height - len(rows_down))
+    yield rows[rows_down.tolist()].select("t", "line")

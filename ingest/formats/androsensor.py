@@ -92,15 +92,15 @@ class AndroSensor:
         header = require_header(path, _is_header, WANTED)
         report = ReportBuilder()
         attachments: list[SourceAttachment] = []
-        known = _known(header.names)
+        columns = _known(header.names)
         if header.names[0] in SHORT:
             report.note(
                 "assumed_unit",
                 "the header has no units: those of AndroSensor are taken (m/s², rad/s, µT, °, ms)",
                 line=header.line,
             )
-        parts = _parts(path, known)
-        used = {n for k, n in known.items() if not k.startswith("gravity")}
+        parts = _parts(path, columns)
+        used = {n for k, n in columns.items() if not k.startswith("gravity")}
         note_unused(header.names, used, report, header.line)
         device = {
             "clock": "device",
@@ -113,7 +113,7 @@ class AndroSensor:
         stream = Stream(parts, report, attachments=attachments)
         return Import(
             channels=declared([stream]),
-            blocks=_blocks(path, header, known, stream, report, device),
+            blocks=_blocks(path, header, columns, stream, report, device),
             report=report,
             metadata={"device": device},
             attachments=attachments,
@@ -130,22 +130,22 @@ def _is_header(cells: Sequence[str]) -> bool:
 
 def _known(names: Sequence[str]) -> dict[str, str]:
     """Return what is known (``acc x``, ``lat`` …) and the name of its column."""
-    found: dict[str, str] = {}
+    columns: dict[str, str] = {}
     for name in names:
         if name in SHORT:
-            found[SHORT[name]] = name
+            columns[SHORT[name]] = name
         for key, pattern in _SENSORS:
             if m := pattern.match(name):
-                found.setdefault(f"{key} {m[1].lower()}", name)
+                columns.setdefault(f"{key} {m[1].lower()}", name)
         for key, pattern in _OTHERS:
             if pattern.match(name):
-                found.setdefault(key, name)
-    return found
+                columns.setdefault(key, name)
+    return columns
 
 
-def _parts(path: Path, known: dict[str, str]) -> list[StreamChannel]:
+def _parts(path: Path, columns: dict[str, str]) -> list[StreamChannel]:
     def three(key: str) -> list[str]:
-        names = [known.get(f"{key} {a}", "") for a in "xyz"]
+        names = [columns.get(f"{key} {a}", "") for a in "xyz"]
         return names if all(names) else []
 
     imu: dict[str, SourceColumn] = {}
@@ -160,14 +160,14 @@ def _parts(path: Path, known: dict[str, str]) -> list[StreamChannel]:
         )
     if names := three("mag"):
         parts.append(StreamChannel("/phone/mag", MAG, xyz(FIELD, names, MICROTESLA)))
-    angles = [known.get(a, "") for a in ("azimuth", "pitch", "roll")]
+    angles = [columns.get(a, "") for a in ("azimuth", "pitch", "roll")]
     if all(angles):
         parts.append(orientation_part(angles))
-    if "pressure" in known:
-        source = {"pressure_pa": SourceColumn(known["pressure"], HECTOPASCAL)}
+    if "pressure" in columns:
+        source = {"pressure_pa": SourceColumn(columns["pressure"], HECTOPASCAL)}
         parts.append(StreamChannel("/phone/pressure", PRESSURE, source, held=True))
-    if "lat" in known and "lon" in known:
-        parts.append(fix_part({k: known[k] for k in ("lat", "lon", "alt", "accuracy") if k in known}))
+    if "lat" in columns and "lon" in columns:
+        parts.append(fix_part({k: columns[k] for k in ("lat", "lon", "alt", "accuracy") if k in columns}))
     if not parts:
         raise MarchaError(f"{path}: no sensor with its three axes in the header; nothing to convert")
     return parts
@@ -186,23 +186,23 @@ def orientation_part(names: Sequence[str]) -> StreamChannel:
 def _blocks(
     path: Path,
     header: Header,
-    known: dict[str, str],
+    columns: dict[str, str],
     stream: Stream,
     report: ReportBuilder,
     device: dict[str, str],
 ) -> Iterator[tuple[str, pl.DataFrame]]:
-    yield from stream.pull(_frames(path, header, known, report, device))
+    yield from stream.pull(_frames(path, header, columns, report, device))
     require_rows(path, [stream])
 
 
 def _frames(
-    path: Path, header: Header, known: dict[str, str], report: ReportBuilder, device: dict[str, str]
+    path: Path, header: Header, columns: dict[str, str], report: ReportBuilder, device: dict[str, str]
 ) -> Iterator[pl.DataFrame]:
-    texts = {n for n in header.names if n and n not in known.values()} | {known.get("wall", "")}
+    texts = {n for n in header.names if n and n not in columns.values()} | {columns.get("wall", "")}
     first = True
-    for frame in float_blocks(path, header, known["ms"], report, texts=texts):
-        if first and "wall" in known and frame.height:
-            device["wall_clock_start"] = f"{frame[known['wall']][0]} (local time of the phone)"
+    for frame in float_blocks(path, header, columns["ms"], report, texts=texts):
+        if first and "wall" in columns and frame.height:
+            device["wall_clock_start"] = f"{frame[columns['wall']][0]} (local time of the phone)"
             first = False
-        t = whole_ns(frame[known["ms"]], 1e3).alias("t")
-        yield pl.DataFrame([*(s for s in frame.get_columns() if s.name not in (*texts, known["ms"])), t])
+        t = whole_ns(frame[columns["ms"]], 1e3).alias("t")
+        yield pl.DataFrame([*(s for s in frame.get_columns() if s.name not in (*texts, columns["ms"])), t])

@@ -126,8 +126,8 @@ class _System:
         kinds = self._channels["type"].to_list()
         self._latency = kinds.index("LATENCY") if "LATENCY" in kinds else None
         self.start_ns, self.utc = int(facts.get("start_ns", 0)), False
-        if not facts and (at := _acquired(path, root)) is not None:
-            self.start_ns, self.utc = at, True
+        if not facts and (acquired_ns := _acquired(path, root)) is not None:
+            self.start_ns, self.utc = acquired_ns, True
         stated = facts.get("columns", {}).get(path.name)
         if stated is not None and [s[0] for s in stated] == names[1:]:
             self._fields = _own_fields(stated)
@@ -176,15 +176,15 @@ class _System:
             return self.start_ns + np.rint((rows - 1) * (1e9 / rate)).astype(np.int64), values, rows
         factor, _ = conversion(str(self._channels["units"][self._latency]), "ns")
         seconds = values[:, self._latency]
-        known = np.isfinite(seconds)
-        if not known.all():
+        finite = np.isfinite(seconds)
+        if not finite.all():
             self._report.drop(
                 "bad_row",
                 "a row without a time in its LATENCY channel; dropped",
-                count=int((~known).sum()),
-                line=int(rows[~known][0]),
+                count=int((~finite).sum()),
+                line=int(rows[~finite][0]),
             )
-            values, rows, seconds = values[known], rows[known], seconds[known]
+            values, rows, seconds = values[finite], rows[finite], seconds[finite]
         t_ns = self.start_ns + np.rint(seconds * factor).astype(np.int64)
         if len(t_ns) > 2 and isinstance(rate, int | float) and rate > 0:
             measured = (len(t_ns) - 1) * 1e9 / max(1, int(t_ns[-1] - t_ns[0]))
@@ -207,13 +207,13 @@ def _tables(path: Path) -> list[Path]:
     if relative.parts[:1] == ("derivatives",):
         relative = Path(*relative.parts[2:])
     folders = [root / relative, *sorted(p / relative for p in (root / "derivatives").glob("*") if p.is_dir())]
-    found = []
+    tables = []
     for folder in folders:
         for other in sorted(folder.glob("*_motion.tsv")) if folder.is_dir() else ():
             same = _NAME.fullmatch(other.name)
             if same and same["head"] == match["head"] and same["run"] == match["run"]:
-                found.append(other)
-    return found or [path]
+                tables.append(other)
+    return tables or [path]
 
 
 def _root(path: Path) -> Path:
@@ -243,18 +243,18 @@ def _annotations(path: Path, start_ns: int) -> pl.DataFrame | None:
     tables = [read_events(p, start_ns, tier="events") for p in _events(path)]
     if not tables:
         return None
-    found = pl.concat(tables)
+    events = pl.concat(tables)
     match = _NAME.fullmatch(path.name)
     kept = _root(path) / "sourcedata" / f"{match['head']}{match['run'] or ''}_events.tsv" if match else path
     if not match or not kept.is_file():
-        return found
+        return events
     exact = read_events(kept, start_ns)
     same = bids_events(exact).with_columns(pl.Series("row", range(exact.height), dtype=pl.Int64))
     key = ["id", "tier", "start_ns", "end_ns", "label", "note", "source", "channel", "confidence"]
-    rows = found.join(same.select(*key, "row"), on=key, how="left", nulls_equal=True, maintain_order="left")[
+    rows = events.join(same.select(*key, "row"), on=key, how="left", nulls_equal=True, maintain_order="left")[
         "row"
     ]
-    return pl.concat([exact[rows.drop_nulls().to_list()], found.filter(rows.is_null())])
+    return pl.concat([exact[rows.drop_nulls().to_list()], events.filter(rows.is_null())])
 
 
 def _own_facts(path: Path) -> tuple[Path, dict[str, Any]]:
@@ -272,10 +272,10 @@ def _json(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
     try:
-        found = json.loads(read_small(path))
+        content = json.loads(read_small(path))
     except ValueError as error:
         raise MarchaError(f"{path}: is not JSON: {error}") from None
-    return found if isinstance(found, dict) else {}
+    return content if isinstance(content, dict) else {}
 
 
 def _channels(path: Path) -> pl.DataFrame:
@@ -307,10 +307,14 @@ def _acquired(path: Path, root: Path) -> int | None:
             rows = [line.split("\t") for line in read_text(scans).split("\n") if line.strip()]
             if not rows or not {"filename", "acq_time"} <= set(rows[0]):
                 continue
-            name, at = rows[0].index("filename"), rows[0].index("acq_time")
+            name, column = rows[0].index("filename"), rows[0].index("acq_time")
             for row in rows[1:]:
-                if len(row) == len(rows[0]) and row[name].endswith(path.name) and row[at] not in ("n/a", ""):
-                    return _instant(scans, row[at])
+                if (
+                    len(row) == len(rows[0])
+                    and row[name].endswith(path.name)
+                    and row[column] not in ("n/a", "")
+                ):
+                    return _instant(scans, row[column])
         if folder == root:
             break
     return None

@@ -238,12 +238,12 @@ def _device_file(log: Path, named: str | None) -> Path:
     """Return the table of receivers that belongs to a log."""
     if named is not None:
         return Path(named)
-    found = next((f for d in (log.parent, log.parent.parent) for f in [sorted(d.glob("*.dev"))] if f), [])
-    if len(found) != 1:
+    tables = next((f for d in (log.parent, log.parent.parent) for f in [sorted(d.glob("*.dev"))] if f), [])
+    if len(tables) != 1:
         raise UsageError(
-            f"{log}: {len(found) or 'no'} table of receivers (.dev) beside it; name it with devices=FILE.dev"
+            f"{log}: {len(tables) or 'no'} table of receivers (.dev) beside it; name it with devices=FILE.dev"
         )
-    return found[0]
+    return tables[0]
 
 
 def _devices(file: Path) -> dict[str, tuple[list[float], str]]:

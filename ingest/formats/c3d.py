@@ -69,8 +69,8 @@ class C3d:
         """The key byte of its header, and that of its parameter section where it says."""
         if len(head) < 1024 or head[1] != 0x50 or not head[0]:
             return 0.0
-        at = (head[0] - 1) * 512
-        return 0.95 if len(head) < at + 4 or head[at + 3] in (84, 85, 86) else 0.0
+        offset = (head[0] - 1) * 512
+        return 0.95 if len(head) < offset + 4 or head[offset + 3] in (84, 85, 86) else 0.0
 
     def read(self, paths: Sequence[Path], options: MarkerOptions) -> Import:
         """Read one file."""
@@ -98,18 +98,21 @@ class C3d:
         device = {"time": "frames at the header's rate; frame 1 is at 0", "rate_hz": f"{rate:g}"}
         analog = _analog(path, head, signals, rate)
         if pos.shape[1]:
-            found = marker_import(
+            markers = marker_import(
                 t_ns, np.arange(1, len(pos) + 1), names, pos * factor, report, device, options
             )
-            channels, blocks = list(found.channels), found.blocks()
+            channels, blocks = list(markers.channels), markers.blocks()
         else:
             channels, blocks = [], iter(())
-        at = np.rint(
+        frame_ns = np.rint(
             head["first_frame"] * (1e9 / rate)
             + np.arange(len(signals)) * (1e9 / (head["analog_rate_hz"] or rate))
         )
         rows = blocks_of(
-            at.astype(np.int64), np.arange(1, len(signals) + 1), [(s.topic, t) for s, t in analog], report
+            frame_ns.astype(np.int64),
+            np.arange(1, len(signals) + 1),
+            [(s.topic, t) for s, t in analog],
+            report,
         )
         return Import(
             channels=[*channels, *(spec for spec, _ in analog)],
@@ -131,7 +134,7 @@ def _analog(
     for k, label in enumerate(labels):
         topic, _, column = label.rpartition("/")
         groups.setdefault(topic, {})[column] = k
-    found: list[tuple[ChannelSpec, pl.DataFrame]] = []
+    channels: list[tuple[ChannelSpec, pl.DataFrame]] = []
     others: list[int] = []
     for topic, columns in groups.items():
         schema = next(
@@ -147,15 +150,15 @@ def _analog(
             except UsageError as error:
                 raise MarchaError(f"{path}: ANALOG:UNITS of {labels[k]}: {error}") from None
             table[column] = signals[:, k] * factor
-        found.append((ChannelSpec(f"/{topic}", schema, "", tuple(table)), pl.DataFrame(table)))
+        channels.append((ChannelSpec(f"/{topic}", schema, "", tuple(table)), pl.DataFrame(table)))
     if others:
         names = unique_markers([labels[k] for k in others], path, 1)
         about = {f"unit.{n}": units[k] for n, k in zip(names, others, strict=True) if units[k]}
         values = pl.DataFrame({n: signals[:, k] for n, k in zip(names, others, strict=True)})
-        found.append(
+        channels.append(
             (ChannelSpec("/analog/values", "marcha_msgs/msg/NamedValues", "", tuple(names), about), values)
         )
-    return found
+    return channels
 
 
 def _events(path: Path, head: dict[str, Any]) -> pl.DataFrame | None:
@@ -169,10 +172,10 @@ def _events(path: Path, head: dict[str, Any]) -> pl.DataFrame | None:
             "remove the group or export the file again"
         )
     contexts = [c.strip() for c in head["event_contexts"]] + [""] * used
-    at = pl.Series(np.rint(np.array(seconds[:used]) * 1e9).astype(np.int64))
+    t_ns = pl.Series(np.rint(np.array(seconds[:used]) * 1e9).astype(np.int64))
     tiers = [c or "events" for c in contexts[:used]]
     return pl.DataFrame(
-        {"tier": tiers, "start_ns": at, "end_ns": at, "label": [x.strip() for x in labels[:used]]}
+        {"tier": tiers, "start_ns": t_ns, "end_ns": t_ns, "label": [x.strip() for x in labels[:used]]}
     )
 
 

@@ -163,8 +163,10 @@ def _read_mapping(map_file: Path, path: Path) -> ExoMapping:
     for name, joint in mapping.joint.items():
         for end in (joint.upper, joint.lower):
             if end not in mapping.segment:
-                known = ", ".join(mapping.segment)
-                raise MarchaError(f"{map_file}: joint.{name}: {end!r} is no segment of it; there are {known}")
+                segments = ", ".join(mapping.segment)
+                raise MarchaError(
+                    f"{map_file}: joint.{name}: {end!r} is no segment of it; there are {segments}"
+                )
         if joint.upper == joint.lower:
             raise MarchaError(f"{map_file}: joint.{name}: upper and lower are both {joint.upper!r}")
     return mapping

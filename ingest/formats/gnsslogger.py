@@ -108,23 +108,23 @@ class GnssLogger:
 
 def _columns(path: Path) -> dict[str, list[str]]:
     """Return the columns of every kind of row from the # lines; an empty name where a cell is not read."""
-    found: dict[str, list[str]] = {}
+    columns: dict[str, list[str]] = {}
     for line in start_of(path, HEAD_BYTES).decode("utf-8", "replace").splitlines():
         cells = [c.strip() for c in line.lstrip("# ").split(",")]
         if not line.startswith("#") or len(cells) < 4:
             continue
         kind = cells[0]
         if kind == "Fix":
-            found[kind] = [_FIX.get(c.lower(), "") for c in cells]
+            columns[kind] = [_FIX.get(c.lower(), "") for c in cells]
         elif kind.removeprefix("Uncal") in _SENSORS:
-            found[kind] = [_sensor_column(c) for c in cells]
-    for kind, names in found.items():
+            columns[kind] = [_sensor_column(c) for c in cells]
+    for kind, names in columns.items():
         wanted = ("t", "lat", "lon") if kind == "Fix" else ("t", "x", "y", "z")
         if any(n not in names for n in wanted):
             raise MarchaError(
                 f"{path}: the header of {kind} lacks time, axes or position; not a known version"
             )
-    return found
+    return columns
 
 
 def _sensor_column(name: str) -> str:

@@ -114,22 +114,22 @@ class IndoorLocation:
 
 def _about(path: Path) -> dict[str, str]:
     """Return what the first lines say about site and phone."""
-    known = {
+    words = {
         "SiteName": "site",
         "FloorName": "floor",
         "Brand": "brand",
         "Model": "phone",
         "AndroidName": "os_release",
     }
-    found: dict[str, str] = {}
+    facts: dict[str, str] = {}
     try:
         with path.open(encoding="utf-8", errors="replace") as f:
             for _, line in zip(range(40), f, strict=False):
                 if line.startswith("#"):
-                    found |= {known[k]: v.strip() for k, v in _HEAD.findall(line) if k in known and v.strip()}
+                    facts |= {words[k]: v.strip() for k, v in _HEAD.findall(line) if k in words and v.strip()}
     except OSError as error:
         raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
-    return found
+    return facts
 
 
 def _kinds(path: Path) -> set[str]:
@@ -198,12 +198,12 @@ def radio_frame(frame: pl.DataFrame, technology: str, report: ReportBuilder) -> 
     """
     good = frame["mac"].str.contains(r"^(?i)[0-9a-f]{2}(:[0-9a-f]{2}){5}$").fill_null(False)
     if not good.all():
-        at = int((~good).arg_true()[0])
+        first = int((~good).arg_true()[0])
         report.drop(
             "bad_row",
-            f"{technology} signal of {frame['mac'][at]!r}: no hardware address; row dropped",
+            f"{technology} signal of {frame['mac'][first]!r}: no hardware address; row dropped",
             count=int((~good).sum()),
-            line=frame["line"][at],
+            line=frame["line"][first],
             subject=f"{technology} address",
         )
         frame = frame.filter(good)

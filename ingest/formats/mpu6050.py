@@ -113,16 +113,16 @@ def scales(
             f"{paths[0]}: the files' names give different full scales ({', '.join(sorted(names))})"
         )
     name = next(iter(names), None)
-    found = {}
+    result = {}
     for sensor in sensors:
         k = (sensor - 1) % 2
         fields = (f"accel{k + 1}_g", f"gyro{k + 1}_dps")
         values, sources = [], set()
         for j, (field, table) in enumerate(zip(fields, (ACC_SCALES, GYR_SCALES), strict=True)):
-            given = getattr(options, field)
+            chosen = getattr(options, field)
             code = options.conf or name
-            if given is not None:
-                values.append(next(row for row in table.values() if row[0] == given))
+            if chosen is not None:
+                values.append(next(row for row in table.values() if row[0] == chosen))
                 sources.add(f"option {field}")
             elif code is not None:
                 values.append(table[int(code[2 * k + j])])
@@ -133,10 +133,10 @@ def scales(
                     f"or give --set conf=A1G1A2G2 (codes 0–3) or --set {fields[0]}=… --set {fields[1]}=…"
                 )
         (acc_g, per_g), (dps, per_dps) = values
-        found[sensor] = Scale(
+        result[sensor] = Scale(
             acc_g, dps, STANDARD_GRAVITY / per_g, math.radians(1.0) / per_dps, ", ".join(sorted(sources))
         )
-    return found
+    return result
 
 
 def channel(sensor: int, scale: Scale) -> ChannelSpec:

@@ -102,12 +102,12 @@ def _packet_starts(data: NDArray[np.uint8]) -> NDArray[np.int64]:
     last = data.size - SIZE + 1
     if last <= 0:
         return np.empty(0, dtype=np.int64)
-    found = np.flatnonzero((data[:last] == 36) & (data[26 : 26 + last] == 13) & (data[27 : 27 + last] == 10))
-    if found.size < 2 or (np.diff(found) >= SIZE).all():
-        return found
+    starts = np.flatnonzero((data[:last] == 36) & (data[26 : 26 + last] == 13) & (data[27 : 27 + last] == 10))
+    if starts.size < 2 or (np.diff(starts) >= SIZE).all():
+        return starts
     kept = []  # a '$' inside a packet may have CR LF at its distance: the first in the stream is real
     free = 0
-    for start in found.tolist():
+    for start in starts.tolist():
         if start >= free:
             kept.append(start)
             free = start + SIZE
@@ -128,10 +128,10 @@ def _packets(path: Path) -> Iterator[tuple[NDArray[np.void], list[tuple[int, int
                 stop = data.size if ended else max(int(ends[-1]) if starts.size else 0, data.size - SIZE + 1)
                 edges = zip([0, *ends.tolist()], [*starts.tolist(), stop], strict=True)
                 lost = [(offset + a, b - a) for a, b in edges if b > a]
-                found = (
+                packets = (
                     np.lib.stride_tricks.sliding_window_view(data, SIZE)[starts] if starts.size else data[:0]
                 )
-                yield np.ascontiguousarray(found).view(PACKET).reshape(-1), lost
+                yield np.ascontiguousarray(packets).view(PACKET).reshape(-1), lost
                 rest, offset = data[stop:].tobytes(), offset + stop
     except OSError as error:
         raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
@@ -148,12 +148,12 @@ def _sensors(paths: Sequence[Path]) -> dict[int, int]:
         counts.update(packets["id"].tolist())
     if not counts:
         raise MarchaError(f"{paths[0]}: no 28-byte '$' packet in it; is it the device's binary log?")
-    known = max((NUMBERS, ADDRESSES, FROM_ZERO), key=lambda k: sum(counts[i] for i in k))
-    if not counts.keys() & known.keys():
+    numbering = max((NUMBERS, ADDRESSES, FROM_ZERO), key=lambda k: sum(counts[i] for i in k))
+    if not counts.keys() & numbering.keys():
         raise MarchaError(
             f"{paths[0]}: packets of devices {sorted(counts)}; known ids are 1 2, 0 1 or 0x68 0x69"
         )
-    return {i: n for i, n in known.items() if i in counts}
+    return {i: n for i, n in numbering.items() if i in counts}
 
 
 def _blocks(

@@ -123,11 +123,11 @@ class _WallClock:
         self._rows = 0
 
     def feed(self, rows: IntegerRows) -> None:
-        at = np.flatnonzero(rows.wall_ms >= 0)
-        if not at.size:
+        stamped = np.flatnonzero(rows.wall_ms >= 0)
+        if not stamped.size:
             return
-        self._rows += at.size
-        ends = [(int(rows.wall_ms[i]), int(rows.values[0, i])) for i in (at[0], at[-1])]
+        self._rows += stamped.size
+        ends = [(int(rows.wall_ms[i]), int(rows.values[0, i])) for i in (stamped[0], stamped[-1])]
         self._seen = [self._seen[0] if self._seen else ends[0], ends[1]]
 
     def metadata(self) -> dict[str, str]:

@@ -69,10 +69,10 @@ class MpuEncoderMat:
         }
         quats = {f"quat{k}{q}": f"all_imu{k}_q{q}" for k in "12" for q in range(1, 5)}
         wanted = {"all_time", "all_encoder", *inertial.values(), *quats.values()}
-        found = read_mat(path, wanted)
+        variables = read_mat(path, wanted)
         values = {}
-        for name in sorted(wanted - set(quats.values()) | (set(quats.values()) & set(found))):
-            variable = found.get(name)
+        for name in sorted(wanted - set(quats.values()) | (set(quats.values()) & set(variables))):
+            variable = variables.get(name)
             if variable is None:
                 raise MarchaError(f"{path}: no variable {name!r}; the format needs all_time, all_encoder …")
             if variable.values is None:
@@ -89,8 +89,10 @@ class MpuEncoderMat:
         report = ReportBuilder()
         good = np.isfinite(values["all_time"])
         if not good.all():
-            at = int(np.argmin(good))
-            report.drop("bad_row", "a row without a time; dropped", count=int((~good).sum()), line=at + 1)
+            first_bad = int(np.argmin(good))
+            report.drop(
+                "bad_row", "a row without a time; dropped", count=int((~good).sum()), line=first_bad + 1
+            )
             values = {name: v[good] for name, v in values.items()}
         t_ns, unit = _times(values["all_time"], report)
         tables: list[tuple[ChannelSpec, pl.DataFrame]] = []

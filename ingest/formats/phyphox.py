@@ -145,9 +145,9 @@ class Phyphox:
 
 def _tables(folder: Path) -> list[Path]:
     """Return the CSV files of measurements: not those of ``meta``, not deeper than a zip's top folder."""
-    found = sorted(p for p in (*folder.glob("*.csv"), *folder.glob("*/*.csv")) if p.is_file())
-    known = [p for p in found if p.parent.name != "meta" and p.name not in ("time.csv", "device.csv")]
-    return [p for p in known if find_header(start_of(p), _is_header) or _saved_by_spreadsheet(start_of(p))]
+    paths = sorted(p for p in (*folder.glob("*.csv"), *folder.glob("*/*.csv")) if p.is_file())
+    sensors = [p for p in paths if p.parent.name != "meta" and p.name not in ("time.csv", "device.csv")]
+    return [p for p in sensors if find_header(start_of(p), _is_header) or _saved_by_spreadsheet(start_of(p))]
 
 
 def _is_header(cells: Sequence[str]) -> bool:
@@ -215,10 +215,10 @@ def _part(file: Path, header: Header) -> StreamChannel | None:
 def _beside(path: Path, name: str) -> Path | None:
     """Return a file of ``meta``, also where it lies beside the tables."""
     folder = path if path.is_dir() else path.parent
-    found = [
+    paths = [
         p for pattern in (f"meta/{name}", name, f"*/meta/{name}", f"*/{name}") for p in folder.glob(pattern)
     ]
-    return found[0] if found else None
+    return paths[0] if paths else None
 
 
 def _rows(file: Path) -> list[list[str]]:
@@ -238,15 +238,15 @@ def _runs(path: Path) -> list[_Run]:
     begun: tuple[float, int] | None = None
     for k, cells in enumerate(_rows(file)[1:], 2):
         try:
-            at, system = float(cells[1].replace(",", ".")), float(cells[2].replace(",", "."))
+            elapsed, system = float(cells[1].replace(",", ".")), float(cells[2].replace(",", "."))
         except (IndexError, ValueError):
             raise MarchaError(
                 f"{file}, line {k}: not event, experiment time, system time; repair or remove it"
             ) from None
         if cells[0].upper() == "START":
-            begun = (at, round(system * 1e6) * 1000)
+            begun = (elapsed, round(system * 1e6) * 1000)
         elif begun is not None:
-            runs.append(_Run(begun[0], at, begun[1]))
+            runs.append(_Run(begun[0], elapsed, begun[1]))
             begun = None
     if begun is not None:
         runs.append(_Run(begun[0], np.inf, begun[1]))
@@ -255,14 +255,14 @@ def _runs(path: Path) -> list[_Run]:
 
 def _device(path: Path) -> dict[str, str]:
     file = _beside(path, "device.csv")
-    known = {
+    words = {
         "deviceModel": "phone",
         "deviceRelease": "os_release",
         "version": "app_version",
         "deviceBrand": "brand",
     }
     rows = [] if file is None else _rows(file)
-    return {known[r[0]]: r[1] for r in rows if len(r) > 1 and r[0] in known and r[1]}
+    return {words[r[0]]: r[1] for r in rows if len(r) > 1 and r[0] in words and r[1]}
 
 
 def _blocks(

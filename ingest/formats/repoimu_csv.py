@@ -96,8 +96,8 @@ def _is_header(head: bytes) -> bool:
 
 def _names(paths: Sequence[Path]) -> list[str]:
     """Return ``segment1`` … of the files' names, or the names themselves."""
-    found = [re.search(r"segment[ _-]?(\d+)$", p.stem, re.IGNORECASE) for p in paths]
-    names = [f"segment{m[1]}" if m else plain_name(p.stem) for m, p in zip(found, paths, strict=True)]
+    matches = [re.search(r"segment[ _-]?(\d+)$", p.stem, re.IGNORECASE) for p in paths]
+    names = [f"segment{m[1]}" if m else plain_name(p.stem) for m, p in zip(matches, paths, strict=True)]
     if len(set(names)) < len(names):
         raise MarchaError(f"{paths[0]}: two of the files speak of the same segment ({', '.join(names)})")
     return names

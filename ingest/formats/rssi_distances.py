@@ -82,8 +82,8 @@ class RssiDistances:
         metres = _distances(files, options, stated)
         points: list[SurveyPoint] = []
         for file in sorted(files, key=lambda f: metres[f]):
-            found = _parse(file, report)
-            for node, powers in found.items():
+            powers_of = _parse(file, report)
+            for node, powers in powers_of.items():
                 powers = signed_powers(powers, file.name, report)
                 where = (metres[file], 0.0, 0.0)
                 points.append(
@@ -114,16 +114,16 @@ def _nodes(files: Sequence[Path]) -> list[str]:
 
 
 def _parse(path: Path, report: ReportBuilder) -> dict[str, list[float]]:
-    found: dict[str, list[float]] = {}
+    powers: dict[str, list[float]] = {}
     for line, row in enumerate(read_text(path).splitlines(), start=1):
         if match := _ROW.match(row):
-            found.setdefault(match["node"], []).append(float(match["rssi"]))
+            powers.setdefault(match["node"], []).append(float(match["rssi"]))
         elif row.strip():
             detail = f"{path.name}: {row[:40]!r} is not 'Node A: -31'; dropped"
             report.drop("bad_row", detail, line=line, subject=path.name)
-    if not found:
+    if not powers:
         raise MarchaError(f"{path}: no row 'Node A: -31'; nothing to convert")
-    return found
+    return powers
 
 
 Stated = dict[int, tuple[float, float | None]]
@@ -173,18 +173,18 @@ def _distances(files: Sequence[Path], options: RssiDistancesOptions, stated: Sta
         listed = [float(d) for d in options.distances.split(",") if d.strip()]
     except ValueError:
         raise UsageError(f"distances={options.distances!r}: metres between commas") from None
-    found: dict[Path, float] = {}
+    distances: dict[Path, float] = {}
     for file in files:
         if match := _METRES.match(file.stem):
-            found[file] = float(match["metres"])
+            distances[file] = float(match["metres"])
         elif file.stem.isdigit() and 1 <= int(file.stem) <= len(listed):
-            found[file] = listed[int(file.stem) - 1]
+            distances[file] = listed[int(file.stem) - 1]
         elif file.stem.isdigit() and int(file.stem) in stated:
-            found[file] = stated[int(file.stem)][0]
+            distances[file] = stated[int(file.stem)][0]
         else:
             raise UsageError(
                 f"{file}: nothing says how far point {file.stem} is; give distances=0.1,0.2,… or spreadsheet=FILE.xlsx"
             )
-        if found[file] <= 0:
-            raise UsageError(f"{file}: a distance is positive, not {found[file]:g} m")
-    return found
+        if distances[file] <= 0:
+            raise UsageError(f"{file}: a distance is positive, not {distances[file]:g} m")
+    return distances

@@ -69,7 +69,7 @@ class RssiSheet:
             raise MarchaError(f"{path}: {'is no spreadsheet (.xlsx)' if path.exists() else 'no such file'}")
         wanted = technology_of(options.technology) if options.technology else None
         report = ReportBuilder()
-        given = _anchors(options.anchors)
+        positions = _anchors(options.anchors)
         points: list[SurveyPoint] = []
         heard: dict[str, dict[str, Any]] = {}
         shapes: set[str] = set()
@@ -86,7 +86,7 @@ class RssiSheet:
             mine = _points(table, shape, technology, label, report, heard)
             if shape == "points":
                 _look_exchanged(
-                    mine, {m: given.get(a["name"]) for m, a in heard.items()}, heard, label, report
+                    mine, {m: positions.get(a["name"]) for m, a in heard.items()}, heard, label, report
                 )
             points += mine
         if not points:
@@ -96,13 +96,13 @@ class RssiSheet:
         if shapes == {"distance"}:
             anchors = [{**a, "x": 0.0, "y": 0.0} for a in heard.values()]
         else:
-            missing = sorted({a["name"] for a in heard.values()} - set(given))
-            if given and missing:
+            missing = sorted({a["name"] for a in heard.values()} - set(positions))
+            if positions and missing:
                 raise UsageError(
-                    f"anchors: nothing says where {missing[0]} stands; there are {', '.join(given)}"
+                    f"anchors: nothing says where {missing[0]} stands; there are {', '.join(positions)}"
                 )
-            anchors = [{**a, **given[a["name"]]} for a in heard.values()] if given else []
-            if not given:
+            anchors = [{**a, **positions[a["name"]]} for a in heard.values()] if positions else []
+            if not positions:
                 report.note(
                     "no_anchors",
                     "nothing says where the anchors stand: fingerprints do without; for ranges: anchors=A 0 0, B 0 4 …",
@@ -145,7 +145,7 @@ def _points(
         if shape == "distance"
         else table[columns["y"]].cast(pl.Float64, strict=False).to_list()
     )
-    found: list[SurveyPoint] = []
+    points: list[SurveyPoint] = []
     for k, (px, py) in enumerate(zip(x, y, strict=True)):
         here = {n: v[k] for n, v in powers.items() if v[k] == v[k]}
         if px is None or py is None or not here:
@@ -154,8 +154,8 @@ def _points(
             )
             continue
         heard_here = {local_address(f"{technology} {n}"): (technology, [v]) for n, v in here.items()}
-        found.append(SurveyPoint((float(px), float(py), 0.0), heard_here))
-    return found
+        points.append(SurveyPoint((float(px), float(py), 0.0), heard_here))
+    return points
 
 
 def _exchanged(table: pl.DataFrame, exchange: str, label: str, report: ReportBuilder) -> pl.DataFrame:
@@ -197,8 +197,10 @@ def _look_exchanged(
     power = np.array([p for *_, p in rows])
 
     def left(order: dict[str, str]) -> float:
-        at = [places[order[mac]] or {} for _, mac, _ in rows]
-        d = np.array([np.hypot(w[0] - a["x"], w[1] - a["y"]) for (w, *_), a in zip(rows, at, strict=True)])
+        stations = [places[order[mac]] or {} for _, mac, _ in rows]
+        d = np.array(
+            [np.hypot(w[0] - a["x"], w[1] - a["y"]) for (w, *_), a in zip(rows, stations, strict=True)]
+        )
         design = np.column_stack([np.ones(len(d)), -10 * np.log10(np.maximum(d, 0.1))])
         solution, *_ = np.linalg.lstsq(design, power, rcond=None)
         return float(((power - design @ solution) ** 2).sum())
@@ -220,7 +222,7 @@ def _look_exchanged(
 
 
 def _anchors(text: str) -> dict[str, dict[str, float]]:
-    found: dict[str, dict[str, float]] = {}
+    anchors: dict[str, dict[str, float]] = {}
     for part in filter(None, (p.strip() for p in text.split(","))):
         name, *place = part.split()
         try:
@@ -229,5 +231,5 @@ def _anchors(text: str) -> dict[str, dict[str, float]]:
             numbers = []
         if len(numbers) not in (2, 3):
             raise UsageError(f"anchors: {part!r} is not name x y [z], such as A 0 0, B 0 4, C 4 0")
-        found[name] = dict(zip("xyz", numbers, strict=False))
-    return found
+        anchors[name] = dict(zip("xyz", numbers, strict=False))
+    return anchors

@@ -100,12 +100,12 @@ def _frames(
         )
         bad = stamp.is_null()
         if bad.any():
-            at = int(bad.arg_true()[0])
+            first = int(bad.arg_true()[0])
             report.drop(
                 "bad_row",
-                f"{frame['date'][at]} {frame['time'][at]}: no date and time; row dropped",
+                f"{frame['date'][first]} {frame['time'][first]}: no date and time; row dropped",
                 count=int(bad.sum()),
-                line=frame["line"][at],
+                line=frame["line"][first],
             )
         yield frame.drop("date", "time").with_columns(t=stamp.cast(pl.Int64)).filter(~bad)
 

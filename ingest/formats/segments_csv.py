@@ -56,8 +56,8 @@ class SegmentsOptions(OrientationOptions, frozen=True, kw_only=True):
 
 
 def _accept(cells: Sequence[str]) -> bool:
-    found = [m for c in cells if (m := _COLUMN.fullmatch(c))]
-    return len(found) >= 3 and len(found) == len([c for c in cells if c])
+    columns = [m for c in cells if (m := _COLUMN.fullmatch(c))]
+    return len(columns) >= 3 and len(columns) == len([c for c in cells if c])
 
 
 class SegmentsCsv:

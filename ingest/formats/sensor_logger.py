@@ -150,8 +150,8 @@ def _tables(path: Path, report: ReportBuilder) -> tuple[dict[str, pl.DataFrame],
         for file in files:
             if file.stem.lower() == "metadata":
                 about = _first_row(file)
-        found = {f.stem: _csv(f, report) for f in files if f.stem in READ}
-        return {k: v for k, v in found.items() if v is not None}, about
+        tables = {f.stem: _csv(f, report) for f in files if f.stem in READ}
+        return {k: v for k, v in tables.items() if v is not None}, about
     head = start_of(path)
     if head.startswith(b"SQLite format 3\x00"):
         return _sqlite(path)
@@ -268,11 +268,11 @@ def _streams(
             yield Stream([part], report, subject=name), tables[name]
     name = next((n for n in ("LocationGps", "Location") if n in tables), None)
     if name is not None:
-        known = {
+        wanted = {
             "lat": "latitude", "lon": "longitude", "alt": "altitude",
             "accuracy": "horizontalAccuracy", "vertical": "verticalAccuracy",
         }  # fmt: skip
-        columns = {k: v for k, v in known.items() if v in tables[name].columns}
+        columns = {k: v for k, v in wanted.items() if v in tables[name].columns}
         if "lat" in columns and "lon" in columns:
             fixes = Stream([fix_part(columns)], report, subject=name, even=False, attachments=attachments)
             yield fixes, tables[name]

@@ -209,13 +209,13 @@ def _node(path: Path, header: Header, wanted: str | None) -> str:
 
 
 def _columns(header: Header, node: str) -> dict[str, SourceColumn]:
-    found = {}
+    columns = {}
     for field, (quantity, unit) in _FIELDS.items():
         factor, _ = conversion(unit, SI[quantity])
         for axis in "XYZ":
             if (name := f"{node}:{field}{axis}") in header.names:
-                found[f"{quantity}_{axis.lower()}"] = SourceColumn(name, factor)
-    return found
+                columns[f"{quantity}_{axis.lower()}"] = SourceColumn(name, factor)
+    return columns
 
 
 def _frames(

@@ -107,9 +107,9 @@ def open_table(
     channels, by_file = [], {}
     for i, topic in enumerate(mapping.topic):
         file = _file_of(path, topic, f"{map_file}: topic[{i}].file")
-        found = targets(map_file, mapping, i, topic)
-        by_file.setdefault(file, []).append((f"{map_file}: topic[{i}]", topic, found))
-        names = tuple(t.name for t in found)
+        parts = targets(map_file, mapping, i, topic)
+        by_file.setdefault(file, []).append((f"{map_file}: topic[{i}]", topic, parts))
+        names = tuple(t.name for t in parts)
         channels.append(ChannelSpec(topic.name, schema_name(topic), topic.frame, names, topic.metadata))
     files = [
         _File(map_file, f, mapping, topics, report, subject=f"{f.name}: " if len(by_file) > 1 else "")
@@ -134,8 +134,8 @@ def _file_of(path: Path, topic: Topic, key: str) -> Path:
         if fnmatch.fnmatch(p.relative_to(path).as_posix(), topic.file) or p.name == topic.file
     ]
     if len(fits) != 1:
-        found = "no file" if not fits else f"{len(fits)} files"
-        raise MarchaError(f"{key}: {topic.file!r} fits {found} in {path}")
+        how_many = "no file" if not fits else f"{len(fits)} files"
+        raise MarchaError(f"{key}: {topic.file!r} fits {how_many} in {path}")
     return fits[0]
 
 
@@ -183,10 +183,10 @@ class _File:
                         t,
                         None if t.column is None else self._place(f"{key}.columns.{t.name}", t.column),
                     )
-                    for t in found
+                    for t in entries
                 ],
             )
-            for key, topic, found in topics
+            for key, topic, entries in topics
         ]
         self._rows = 0
         self._last: dict[str, tuple[object, ...]] = {}
@@ -197,11 +197,11 @@ class _File:
         self._clock = TimestampRepair(report, tick_ns=tick, period=period, subject=subject, even=time.even)
         self._tick = tick
         self._checks = {
-            topic.name: check for topic, found in self._topics if (check := self._check(topic, found))
+            topic.name: check for topic, entries in self._topics if (check := self._check(topic, entries))
         }
 
     def blocks(self) -> Iterator[tuple[str, pl.DataFrame]]:
-        places = [p for _, found in self._topics for _, _, p in found if p is not None]
+        places = [p for _, entries in self._topics for _, _, p in entries if p is not None]
         if self._time_at is not None:
             places.append(self._time_at)
         frames = map(self._values, self._cells.rows(places, self._report))
@@ -217,10 +217,10 @@ class _File:
             raise MarchaError(f"{key}: {self.path.name} has no column {column!r}; it has {have}")
         return place
 
-    def _check(self, topic: Topic, found: list[tuple[str, Target, int | None]]) -> SensorCheck | None:
+    def _check(self, topic: Topic, entries: list[tuple[str, Target, int | None]]) -> SensorCheck | None:
         if schema_name(topic) != "sensor_msgs/msg/Imu":
             return None
-        axes = [t for _, t, _ in found if t.name[:4] in ("acc_", "gyr_")]
+        axes = [t for _, t, _ in entries if t.name[:4] in ("acc_", "gyr_")]
         limits = {
             t.name: (-t.full_scale * LAST_COUNT, t.full_scale * LAST_COUNT, f"{t.full_scale:.4g} in SI")
             for t in axes
@@ -232,9 +232,9 @@ class _File:
         """Return ``t`` (ticks), ``line`` and columns ``<topic> <column>``, rows without time left out."""
         lines = block["line"]
         columns: dict[str, pl.Series] = {"t": self._ticks(block), "line": lines}
-        for topic, found in self._topics:
+        for topic, entries in self._topics:
             many = schema_name(topic) in TOGETHER
-            for name, target, place in found:
+            for name, target, place in entries:
                 if place is not None:
                     text = block[f"c{place}"]
                     columns[name] = self._column(name, target, text, lines, topic.name if many else name)
@@ -244,13 +244,13 @@ class _File:
         values = [c for c in frame.columns if c not in ("t", "line")]
         timeless = frame["t"].is_null()
         if timeless.any():
-            at = int(timeless.arg_true()[0])
-            text = block[f"c{self._time_at}"][at]
+            first = int(timeless.arg_true()[0])
+            text = block[f"c{self._time_at}"][first]
             self._report.drop(
                 "bad_row",
                 f"{self.path.name}: {text!r} is no time ({self._time.unit}); row dropped",
                 count=int(timeless.sum()),
-                line=lines[at],
+                line=lines[first],
             )
         void = ~timeless & (frame.select(pl.all_horizontal(pl.col(values).is_null())).to_series())
         if values and void.any():
@@ -296,16 +296,16 @@ class _File:
         self, name: str, target: Target, text: pl.Series, lines: pl.Series, subject: str
     ) -> pl.Series:
         text = text.str.strip_chars()
-        given = text.is_not_null() & (text != "") & ~text.is_in(list(self._layout.missing))
-        if not given.all():
+        filled = text.is_not_null() & (text != "") & ~text.is_in(list(self._layout.missing))
+        if not filled.all():
             self._report.note(
                 "missing_cell",
                 f"{name}: no value; NaN in the recording, or no message where a whole sensor is missing",
-                count=int((~given).sum()),
-                line=lines[int((~given).arg_true()[0])],
+                count=int((~filled).sum()),
+                line=lines[int((~filled).arg_true()[0])],
                 subject=subject,
             )
-        text = _only(text, given)
+        text = _only(text, filled)
         if target.kind == "text":
             return text
         if target.kind == "flag":
@@ -316,12 +316,12 @@ class _File:
         value = (dotted if self._layout.decimal_comma else text).cast(pl.Float64, strict=False)
         comma = (text.str.contains(r"^[+-]?\d+,\d+([eE][+-]?\d+)?$") & value.is_null()).fill_null(False)
         if comma.any():
-            at = int(comma.arg_true()[0])
+            first = int(comma.arg_true()[0])
             self._report.repair(
                 "decimal_comma",
-                f"{name}: {text[at]!r} read as {dotted[at]}",
+                f"{name}: {text[first]!r} read as {dotted[first]}",
                 count=int(comma.sum()),
-                line=lines[at],
+                line=lines[first],
                 subject=name,
             )
             value = value.zip_with(~comma, dotted.cast(pl.Float64, strict=False))
@@ -332,32 +332,32 @@ class _File:
     def _readable(self, name: str, text: pl.Series, value: pl.Series, lines: pl.Series) -> pl.Series:
         bad = text.is_not_null() & value.is_null()
         if bad.any():
-            at = int(bad.arg_true()[0])
+            first = int(bad.arg_true()[0])
             self._report.repair(
                 "missing_cell",
-                f"{name}: {text[at]!r} is not a value: taken as missing",
+                f"{name}: {text[first]!r} is not a value: taken as missing",
                 count=int(bad.sum()),
-                line=lines[at],
+                line=lines[first],
                 subject=f"{name} unreadable",
             )
         return value
 
     def _tables(self, frame: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
-        for topic, found in self._topics:
-            read = [name for name, _, place in found if place is not None]
+        for topic, entries in self._topics:
+            read = [name for name, _, place in entries if place is not None]
             has = frame.filter(pl.any_horizontal(pl.col(c).is_not_null() for c in read)) if read else frame
             table = has.select(
                 "t_ns",
                 "line",
                 *(
                     (pl.lit(t.constant) if place is None else pl.col(name)).alias(t.name)
-                    for name, t, place in found
+                    for name, t, place in entries
                 ),
             )
-            exact = [t.name for _, t, _ in found if t.kind != "number"]
+            exact = [t.name for _, t, _ in entries if t.kind != "number"]
             if exact:
                 table = table.drop_nulls(exact)
-            numbers = [t.name for _, t, _ in found if t.kind == "number"]
+            numbers = [t.name for _, t, _ in entries if t.kind == "number"]
             table = table.with_columns(pl.col(numbers).cast(pl.Float64).fill_null(np.nan))
             if topic.only_changes:
                 table = self._changes(topic, table)

@@ -175,15 +175,15 @@ def _read(
         path, header = tables[kind]
         places = header.roles(roles, named)
         cells = read_cells(path, places, header, report)
-        found = _unit(cells, header.names[places["time"]], path, options, report, of=of) or unit
-        if found is None:
+        own = _unit(cells, header.names[places["time"]], path, options, report, of=of) or unit
+        if own is None:
             raise UsageError(f"{path}: nothing says the unit of time; give time_unit=s, ms, us or ns")
-        if unit is not None and found.clock != unit.clock:
+        if unit is not None and own.clock != unit.clock:
             raise MarchaError(
                 f"{path}: its times are those of another clock than the inertial table's (one since 1970, one not); "
                 "write both by one clock"
             )
-        unit = found
+        unit = own
         if kind == "inertial":
             made |= _inertial(times_ns(cells, unit, path, report), path, options, report)
         else:
@@ -236,12 +236,12 @@ def _inertial(cells: pl.DataFrame, path: Path, options: ThreeTablesOptions, repo
     ).to_series()
     unread = kinds.is_null()
     if unread.any():
-        at = int(unread.arg_true()[0])
+        first = int(unread.arg_true()[0])
         report.drop(
             "unused_row",
-            f"{path.name}: sensor {cells['sensor'][at]!r} is not imported",
+            f"{path.name}: sensor {cells['sensor'][first]!r} is not imported",
             count=int(unread.sum()),
-            line=cells["line"][at],
+            line=cells["line"][first],
             subject=f"{path.name} sensor",
         )
     made: Made = {}
@@ -337,19 +337,19 @@ def _radio(cells: pl.DataFrame, unit: TimeUnit, path: Path, report: ReportBuilde
     )
     positive = cells["rssi"] > 0
     if positive.any():
-        at = int(positive.arg_true()[0])
+        first = int(positive.arg_true()[0])
         report.drop(
             "bad_power",
-            f"{path.name}: {cells['rssi'][at]:g} dBm among negative powers; row dropped",
+            f"{path.name}: {cells['rssi'][first]:g} dBm among negative powers; row dropped",
             count=int(positive.sum()),
-            line=cells["line"][at],
+            line=cells["line"][first],
         )
         cells = cells.filter(~positive)
     cells = without_stale(ordered(cells, path.name, report), path.name, report)
     report.keep(cells.height)
     words = cells["technology"].to_list() if "technology" in cells.columns else [""] * cells.height
-    known = {w: technology_of(w) for w in set(words)}
-    technology = pl.Series([known[w] for w in words], dtype=pl.String)
+    technologies = {w: technology_of(w) for w in set(words)}
+    technology = pl.Series([technologies[w] for w in words], dtype=pl.String)
     table = cells.select("t_ns", "mac", rssi_dbm="rssi", last_seen_ns="seen").with_columns(
         technology=technology
     )

@@ -86,19 +86,19 @@ def _blocks(
     path: Path, stream: Stream, points: Callable[[Path], Iterator[Point]], report: ReportBuilder
 ) -> Iterator[tuple[str, pl.DataFrame]]:
     try:
-        found: list[Point] = list(points(path))
+        track: list[Point] = list(points(path))
     except OSError as error:
         raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
     except (ElementTree.ParseError, ValueError) as error:
         raise MarchaError(f"{path}: is no whole XML of a track: {error}") from None
-    if not found:
+    if not track:
         raise MarchaError(f"{path}: no point of a track; routes and waypoints are no recording")
-    if not any(p[0] for p in found):
+    if not any(p[0] for p in track):
         raise MarchaError(
-            f"{path}: {len(found)} points and no time: a line is no recording; draw it over a map as GeoJSON"
+            f"{path}: {len(track)} points and no time: a line is no recording; draw it over a map as GeoJSON"
         )
     rows = []
-    for k, (text, lat, lon, alt) in enumerate(found, 1):
+    for k, (text, lat, lon, alt) in enumerate(track, 1):
         stamp = _instant(text)
         if stamp is None:
             report.drop("bad_row", f"point {k}: {text!r} is no time; left out", line=k)
@@ -113,11 +113,11 @@ def _blocks(
 
 def _instant(text: str) -> int | None:
     try:
-        at = datetime.fromisoformat(text.strip())
+        moment = datetime.fromisoformat(text.strip())
     except ValueError:
         return None
-    at = at if at.tzinfo else at.replace(tzinfo=UTC)
-    return round(at.timestamp() * 1e6) * 1000
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    return round(moment.timestamp() * 1e6) * 1000
 
 
 def _local(tag: object) -> str:

@@ -70,9 +70,9 @@ class Trc:
             report.note("header_doubt", f"NumFrames is {stated}, but there are {len(values)} rows", line=3)
         timeless = np.isnan(values[:, 1])
         if timeless.any():
-            at = int(np.argmax(timeless))
+            first = int(np.argmax(timeless))
             report.drop(
-                "bad_row", "a row without a time; dropped", count=int(timeless.sum()), line=int(rows[at])
+                "bad_row", "a row without a time; dropped", count=int(timeless.sum()), line=int(rows[first])
             )
             values, rows = values[~timeless], rows[~timeless]
         t_ns = np.rint(values[:, 1] * 1e9).astype(np.int64)

@@ -38,8 +38,8 @@ class ViconCsv:
     def sniff(self, head: bytes, path: Path) -> float:
         """A section's name, a rate and a header of frames."""
         lines = head[:65536].removeprefix(b"\xef\xbb\xbf").decode("utf-8", "replace").splitlines()
-        found = any(_starts(lines, k) for k in range(len(lines) - 3))
-        return 0.95 if found else 0.0
+        begins = any(_starts(lines, k) for k in range(len(lines) - 3))
+        return 0.95 if begins else 0.0
 
     def read(self, paths: Sequence[Path], options: MarkerOptions) -> Import:
         """Read one file."""

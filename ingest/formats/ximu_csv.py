@@ -131,15 +131,15 @@ def _lost(steps: np.ndarray, a_row: float, lines: np.ndarray, report: ReportBuil
     proves nothing; only beyond that something is missing.
     """
     lost = np.where(steps > 2 * a_row + 1, np.round(steps / a_row) - 1, 0).astype(np.int64)
-    at = np.flatnonzero(lost)
-    if at.size:
+    jumps = np.flatnonzero(lost)
+    if jumps.size:
         report.loss(
             "gap",
-            f"{COUNTER} steps by {steps[at[0]]:g} where {a_row:.2f} is usual: about {lost[at[0]]} rows "
+            f"{COUNTER} steps by {steps[jumps[0]]:g} where {a_row:.2f} is usual: about {lost[jumps[0]]} rows "
             "are missing, "
             "the time goes on by as many intervals",
-            count=at.size,
-            line=int(lines[at[0]]),
+            count=jumps.size,
+            line=int(lines[jumps[0]]),
         )
     back = np.flatnonzero(steps < 0)
     if back.size:

@@ -148,7 +148,7 @@ class FloorWalk:
     options: FloorOptions
 
 
-def floor_walk(scenario: str = "floor-walk", *, seed: int = 0, **given: Any) -> FloorWalk:
+def floor_walk(scenario: str = "floor-walk", *, seed: int = 0, **options: Any) -> FloorWalk:
     """Simulate a walk, or a stay, on the source's floor.
 
     Parameters
@@ -157,7 +157,7 @@ def floor_walk(scenario: str = "floor-walk", *, seed: int = 0, **given: Any) -> 
         A key of :data:`FLOOR_SCENARIOS`.
     seed : int
         Of all random numbers.
-    **given
+    **options
         Fields of :class:`FloorOptions`, of :class:`PhoneOptions` and of :class:`ImuErrors`.
 
     Raises
@@ -167,16 +167,16 @@ def floor_walk(scenario: str = "floor-walk", *, seed: int = 0, **given: Any) -> 
     """
     if scenario not in FLOOR_SCENARIOS:
         raise UsageError(f"scenario {scenario!r} is unknown: choose one of {', '.join(FLOOR_SCENARIOS)}")
-    own = {k: given.pop(k) for k in list(given) if k in FloorOptions.__struct_fields__}
+    own = {k: options.pop(k) for k in list(options) if k in FloorOptions.__struct_fields__}
     o = checked(scenario, FloorOptions, own)
     x_axis = np.radians(o.plan_azimuth_deg)
     still = scenario in ("floor-points", "floor-survey")
     stops = np.array(POINTS if scenario == "floor-points" else _grid())
     if still:
         stay = o.window_s * (20 if scenario == "floor-points" else 1)
-        phone = phone_walk("phone-rest", seed=seed, **{"duration_s": stay * len(stops), **given})
-        at = np.minimum((np.arange(len(phone.t_ns)) * len(stops)) // len(phone.t_ns), len(stops) - 1)
-        position = stops[at]
+        phone = phone_walk("phone-rest", seed=seed, **{"duration_s": stay * len(stops), **options})
+        station = np.minimum((np.arange(len(phone.t_ns)) * len(stops)) // len(phone.t_ns), len(stops) - 1)
+        position = stops[station]
     else:
         (x0, y0), route = ROUTES[scenario]
         first = np.array(
@@ -184,7 +184,7 @@ def floor_walk(scenario: str = "floor-walk", *, seed: int = 0, **given: Any) -> 
         )
         declination = np.degrees(phone_walk("phone-rest", seed=0, duration_s=0.5).declination_rad)
         course = {"route": route, "course_deg": o.plan_azimuth_deg + float(declination), "rest_s": REST_S}
-        phone = phone_walk("phone-turns", seed=seed, **{**course, **given})
+        phone = phone_walk("phone-turns", seed=seed, **{**course, **options})
         # plan x = along the x axis, y to the left of it; the walk's own frame is east, true north
         east, north = phone.pos[:, 0], phone.pos[:, 1]
         a = x_axis + phone.declination_rad

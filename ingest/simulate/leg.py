@@ -481,7 +481,7 @@ def leg(scenario: str = "walking", *, seed: int = 0, **options: Any) -> LegCaptu
     """
     if scenario not in SCENARIOS:
         raise UsageError(f"scenario {scenario!r} is unknown: choose one of {', '.join(SCENARIOS)}")
-    given = {name: plain(value) for name, value in options.items()}
-    if isinstance(given.get("segments"), str):
-        given["segments"] = [given["segments"]]
-    return LegCapture(scenario, seed, checked(scenario, LegOptions, given))
+    values = {name: plain(value) for name, value in options.items()}
+    if isinstance(values.get("segments"), str):
+        values["segments"] = [values["segments"]]
+    return LegCapture(scenario, seed, checked(scenario, LegOptions, values))

@@ -66,8 +66,8 @@ class SegmentAngles(NamedTuple):
 
 def _fourier(points: tuple[tuple[float, float], ...]) -> NDArray[np.complex128]:
     """Return complex Fourier coefficients (rad) of a periodic curve through ``points`` (percent, degrees)."""
-    at = np.array([*points, (points[0][0] + 100, points[0][1])], dtype=float)
-    spline = CubicSpline(at[:, 0] / 100, np.radians(at[:, 1]), bc_type="periodic")
+    nodes = np.array([*points, (points[0][0] + 100, points[0][1])], dtype=float)
+    spline = CubicSpline(nodes[:, 0] / 100, np.radians(nodes[:, 1]), bc_type="periodic")
     spectrum = np.asarray(np.fft.rfft(spline(np.arange(128) / 128)) / 128, dtype=np.complex128)
     spectrum[1:] *= 2
     return spectrum[: _HARMONICS + 1]
@@ -344,14 +344,14 @@ def _bend(angles: FloatArray, sign: float) -> FloatArray:
 
 
 def derivatives(
-    at: Callable[[FloatArray], Mapping[str, Pose]], t: FloatArray
+    poses_at: Callable[[FloatArray], Mapping[str, Pose]], t: FloatArray
 ) -> dict[str, tuple[FloatArray, FloatArray, FloatArray, FloatArray]]:
     """Return position (m), ``rot``, acceleration (m/s², in n) and body rate (rad/s) of moving frames.
 
     Fourth-order central differences of the poses ``at`` gives (Abramowitz & Stegun 1964, table 25.2).
     """
     h = STEP_S
-    poses = [at(t + k * h) for k in (-2, -1, 0, 1, 2)]
+    poses = [poses_at(t + k * h) for k in (-2, -1, 0, 1, 2)]
     out = {}
     for name in poses[2]:
         p = [q[name].pos for q in poses]

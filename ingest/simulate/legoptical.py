@@ -23,7 +23,7 @@ def landmarks(body: Body, side: str) -> dict[str, dict[str, FloatArray]]:
     thigh, shank = np.array([0.0, 0.0, -body.thigh_m]), np.array([0.0, 0.0, -body.shank_m])
     wide, narrow = np.array([out * EPICONDYLES_M, 0.0, 0.0]), np.array([out * MALLEOLI_M, 0.0, 0.0])
     down = np.array([0.0, 0.0, -body.ankle_height_m])
-    found = {
+    by_segment = {
         "thigh": {"hip": np.zeros(3), "knee_lat": thigh + wide, "knee_med": thigh - wide},
         "shank": {"knee": np.zeros(3), "ankle_lat": shank + narrow, "ankle_med": shank - narrow},
         "foot": {
@@ -32,10 +32,10 @@ def landmarks(body: Body, side: str) -> dict[str, dict[str, FloatArray]]:
         },
     }
     middle = {"thigh": 0.5 * thigh, "shank": 0.5 * shank, "foot": np.array([0.0, 0.08, -0.02])}
-    for name, marks in found.items():
+    for name, marks in by_segment.items():
         place = middle[name] + (out * 0.06 if name != "foot" else 0.0, 0.0, 0.0)
         marks |= {f"{name}_{k + 1}": place + p for k, p in enumerate(CLUSTER)}
-    return found
+    return by_segment
 
 
 def trunk_markers(body: Body) -> dict[str, FloatArray]:

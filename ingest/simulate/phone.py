@@ -200,7 +200,7 @@ class PhoneWalk:
     seed: int
 
 
-def make_phone_options(scenario: str, given: dict[str, Any]) -> PhoneOptions:
+def make_phone_options(scenario: str, values: dict[str, Any]) -> PhoneOptions:
     """Return checked options from keywords, values as objects or as text.
 
     ``gnss_loss`` and ``gnss_outliers`` as text are ``60:30,200:20`` (start and length, time and size); fields
@@ -215,7 +215,7 @@ def make_phone_options(scenario: str, given: dict[str, Any]) -> PhoneOptions:
         raise UsageError(f"scenario {scenario!r} is unknown: choose one of {', '.join(PHONE_ROUTES)}")
     flat: dict[str, Any] = {}
     imu: dict[str, Any] = {}
-    for name, value in given.items():
+    for name, value in values.items():
         plain = msgspec.to_builtins(value, enc_hook=lambda v: v.tolist())
         if name in ("gnss_loss", "gnss_outliers") and isinstance(plain, str):
             plain = [part.split(":") for part in plain.split(",") if part.strip()]
@@ -326,11 +326,11 @@ def _start_ns(scenario: str, text: str) -> int:
     from datetime import UTC, datetime
 
     try:
-        at = datetime.fromisoformat(text)
+        moment = datetime.fromisoformat(text)
     except ValueError:
         raise UsageError(f"simulate {scenario}: option start={text!r} is no ISO 8601 time") from None
-    at = at if at.tzinfo else at.replace(tzinfo=UTC)
-    return int(at.timestamp() * 1000) * 1_000_000
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    return int(moment.timestamp() * 1000) * 1_000_000
 
 
 def _times(o: PhoneOptions, end_s: float, rng: np.random.Generator) -> FloatArray:

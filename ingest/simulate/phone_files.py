@@ -62,10 +62,10 @@ def write_phone(
 def _held(walk: PhoneWalk) -> np.ndarray:
     """Return latitude, longitude, height of the last fix at every sample; NaN before the first."""
     values = walk.fixes.select("lat_deg", "lon_deg", "alt_m").to_numpy()
-    at = np.searchsorted(walk.fixes["t_ns"].to_numpy(), walk.t_ns, side="right") - 1
+    newest = np.searchsorted(walk.fixes["t_ns"].to_numpy(), walk.t_ns, side="right") - 1
     if not len(values):
-        return np.full((len(at), 3), np.nan)
-    return np.where((at < 0)[:, None], np.nan, values[np.maximum(at, 0)])
+        return np.full((len(newest), 3), np.nan)
+    return np.where((newest < 0)[:, None], np.nan, values[np.maximum(newest, 0)])
 
 
 def _android_text(path: Path, walk: PhoneWalk) -> None:

@@ -264,8 +264,8 @@ class Walker:
         slope = np.zeros_like(grid)
         if s.height_m.any():
             ends = np.cumsum(s.length_m)
-            at = np.minimum(np.searchsorted(ends, grid), len(ends) - 1)
-            slope = np.where((grid >= 0) & (grid <= ends[-1]), s.height_m[at] / s.length_m[at], 0.0)
+            segment = np.minimum(np.searchsorted(ends, grid), len(ends) - 1)
+            slope = np.where((grid >= 0) & (grid <= ends[-1]), s.height_m[segment] / s.length_m[segment], 0.0)
             window = np.hanning(161)
             slope = np.convolve(slope, window / window.sum(), mode="same")
         rate = np.column_stack((np.cos(course), np.sin(course), slope))
@@ -275,8 +275,8 @@ class Walker:
     def course_at(self, way: FloatArray) -> FloatArray:
         """Return the course (rad) at a way from the start (m)."""
         out = np.full_like(way, self.schedule.course_rad)
-        for at, turn in self.schedule.corners:
-            out += turn * _smooth((way - at) / TURN_M + 0.5)
+        for corner, turn in self.schedule.corners:
+            out += turn * _smooth((way - corner) / TURN_M + 0.5)
         return out
 
     def course(self, t: FloatArray) -> FloatArray:
@@ -331,8 +331,8 @@ class Walker:
         if not len(contacts):
             return out
         omega = 2 * np.pi * STRIKE_HZ
-        at = np.searchsorted(contacts, t)
-        for k in (at - 2, at - 1, at):
+        next_contact = np.searchsorted(contacts, t)
+        for k in (next_contact - 2, next_contact - 1, next_contact):
             there = (k >= 0) & (k < len(contacts))
             i = k[there]
             tau = t[there] - contacts[i] - 0.035
@@ -443,6 +443,6 @@ class Phone:
         yaw = grown * p.yaw_deg * np.sin(half + 1.1)
         angles = np.radians(np.column_stack((yaw, pitch, roll)))
         slow = self.handling.turned(t)
-        for hz, at, size in zip(self._wander_hz, self._wander_at, self._wander, strict=True):
-            slow += size * np.sin(2 * np.pi * t[:, None] * hz + at)
+        for hz, phase, size in zip(self._wander_hz, self._wander_at, self._wander, strict=True):
+            slow += size * np.sin(2 * np.pi * t[:, None] * hz + phase)
         return Rotation.from_rotvec(slow) * Rotation.from_euler("ZYX", angles)

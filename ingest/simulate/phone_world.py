@@ -23,14 +23,14 @@ def earth_field(lat_deg: float, lon_deg: float, alt_m: float, t_ns: int) -> Floa
     """Return the Earth's magnetic field (T): east, true north, up; World Magnetic Model of the date."""
     from pygeomag import GeoMag
 
-    at = datetime.fromtimestamp(t_ns / 1e9, UTC)
-    year = at.year + (at.timetuple().tm_yday - 1) / 366
+    moment = datetime.fromtimestamp(t_ns / 1e9, UTC)
+    year = moment.year + (moment.timetuple().tm_yday - 1) / 366
     model = next((y for y in (2025, 2020, 2015) if year >= y), 2015)
     name = {2015: "wmm/WMM_2015v2.COF"}.get(model, f"wmm/WMM_{model}.COF")
-    found = GeoMag(coefficients_file=name).calculate(
+    field = GeoMag(coefficients_file=name).calculate(
         glat=lat_deg, glon=lon_deg, alt=alt_m / 1000, time=year, allow_date_outside_lifespan=True
     )
-    return np.array([found.y, found.x, -found.z]) * 1e-9
+    return np.array([field.y, field.x, -field.z]) * 1e-9
 
 
 def magnetic_disturbance(
@@ -49,11 +49,11 @@ def magnetic_disturbance(
         return out
     way = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(ground, axis=0), axis=1))))
     for k in range(count):
-        at = (k + rng.uniform(0.3, 0.7)) / count * total_m
+        middle = (k + rng.uniform(0.3, 0.7)) / count * total_m
         direction = rng.standard_normal(3)
         direction /= np.linalg.norm(direction)
         turn = rng.standard_normal(3)
-        u = (way - at) / 4.0
+        u = (way - middle) / 4.0
         near = np.where(np.abs(u) < 1, (1 - np.minimum(u * u, 1)) ** 2, 0.0)
         out += strength_t * near[:, None] * (direction + 0.5 * u[:, None] * turn)
     return out
@@ -74,10 +74,10 @@ def fixes_of(
     draws[1:] *= np.sqrt(1 - keep**2)
     slow = np.asarray(lfilter([1.0], [1.0, -keep], draws, axis=0)) if len(t) else draws
     error = (o.gnss_sigma_m * slow + o.gnss_noise_m * rng.standard_normal((len(t), 3))) * axes
-    for at, size in o.gnss_outliers:
+    for outlier_s, size in o.gnss_outliers:
         if len(t):
             angle = rng.uniform(0, 2 * np.pi)
-            error[np.argmin(np.abs(t - at)), :2] += size * np.array([np.cos(angle), np.sin(angle)])
+            error[np.argmin(np.abs(t - outlier_s)), :2] += size * np.array([np.cos(angle), np.sin(angle)])
     lost = np.zeros(len(t), dtype=bool)
     for begin, length in o.gnss_loss:
         lost |= (t >= begin) & (t < begin + length)

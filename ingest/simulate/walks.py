@@ -136,8 +136,8 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
     def imu(self, sensor: int) -> ImuErrors:
         """Return the errors of sensor 1 or 2."""
-        given = (self.imu1, self.imu2)[sensor - 1]
-        return given if given is not None else self._defaults(sensor)
+        errors = (self.imu1, self.imu2)[sensor - 1]
+        return errors if errors is not None else self._defaults(sensor)
 
     def mount(self, sensor: int) -> Mount:
         """Return where sensor 1 or 2 sits."""
@@ -165,7 +165,7 @@ UNKIND_STYLE = {"stance_roll_deg": 1.0, "strike_mm": 0.5}
 """A foot that rolls as it stands, and strikes: about the ball, real ones (Vicon) about a point farther back."""
 
 
-def make_options(scenario: str, given: dict[str, Any]) -> Options:
+def make_options(scenario: str, overrides: dict[str, Any]) -> Options:
     """Return checked options from keywords, values as objects or as text.
 
     Raises
@@ -177,7 +177,7 @@ def make_options(scenario: str, given: dict[str, Any]) -> Options:
         raise UsageError(f"scenario {scenario!r} is unknown: choose one of {', '.join(SCENARIOS)}")
     flat: dict[str, Any] = {}
     parts: dict[str, dict[str, Any]] = {"style": {}, "imu1": {}, "imu2": {}, "mount1": {}, "mount2": {}}
-    for name, raw in given.items():
+    for name, raw in overrides.items():
         head, _, tail = name.partition(".")
         value = plain(raw)
         if tail and head in parts:

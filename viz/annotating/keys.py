@@ -50,8 +50,8 @@ class Keys:
             return self._windows()
         if not select.select([self._fd], [], [], PATIENCE_S)[0]:
             return None
-        found = os.read(self._fd, 1)
-        return found.decode("ascii", "replace") if found else "q"
+        key = os.read(self._fd, 1)
+        return key.decode("ascii", "replace") if key else "q"
 
     def line(self, prompt: str) -> str:
         """Return a line that the user types, without its end and blanks around it."""

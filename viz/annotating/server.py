@@ -241,8 +241,8 @@ class _Handler(BaseHTTPRequestHandler):
         return False
 
     def _allowed(self, token: str) -> bool:
-        given = self.headers.get("X-Marcha-Token") or token
-        if hmac.compare_digest(given.encode(), self.page.token.encode()):
+        stated = self.headers.get("X-Marcha-Token") or token
+        if hmac.compare_digest(stated.encode(), self.page.token.encode()):
             return True
         self.close_connection = True
         self._json({"error": "the address lacks its token; open the printed one"}, HTTPStatus.FORBIDDEN)
@@ -262,12 +262,12 @@ class _Handler(BaseHTTPRequestHandler):
     # ------------------------------------------------------------------------------------------------ answers
 
     def _file(self, name: str) -> None:
-        found = resources.files(__package__ or "") / "web" / name
-        if not found.is_file():
+        resource = resources.files(__package__ or "") / "web" / name
+        if not resource.is_file():
             self._send(b"", "text/plain", status=HTTPStatus.NOT_FOUND)
             return
         kind = TYPES.get(name[name.rfind(".") :], "application/octet-stream")
-        self._send(found.read_bytes(), kind)
+        self._send(resource.read_bytes(), kind)
 
     def _json(self, document: Mapping[str, Any], status: HTTPStatus = HTTPStatus.OK) -> None:
         self._send(msgspec.json.encode(document), "application/json", status=status)

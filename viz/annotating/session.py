@@ -152,7 +152,7 @@ class Session:
         for name in gone:
             if name not in self.rows:
                 raise MarchaError(f"{self.rec.path}: there is no annotation {name!r} any more; look again")
-        given = [
+        rows = [
             {
                 **row,
                 "id": row.get("id") or self._new_id(),
@@ -161,7 +161,7 @@ class Session:
             for row in add
         ]
         try:
-            table = check_annotations(pl.DataFrame(given, schema=COLUMNS, orient="row"))
+            table = check_annotations(pl.DataFrame(rows, schema=COLUMNS, orient="row"))
         except (TypeError, pl.exceptions.PolarsError) as error:
             reason = " ".join(str(error).split())
             raise MarchaError(f"{self.rec.path}: that is no annotation: {reason}") from None
@@ -269,8 +269,8 @@ class Session:
         lines = data[: data.rfind(b"\n") + 1].splitlines()
         for number, line in enumerate(lines, 1):
             try:
-                found = msgspec.json.decode(line, type=Edit)
-                done = self._prepared(found.added, [row["id"] for row in found.removed])
+                edit = msgspec.json.decode(line, type=Edit)
+                done = self._prepared(edit.added, [row["id"] for row in edit.removed])
             except (msgspec.MsgspecError, MarchaError, KeyError) as error:
                 raise MarchaError(
                     f"{self.draft}: line {number}: the draft of an earlier session does not fit the recording "

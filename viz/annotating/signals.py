@@ -39,16 +39,16 @@ class Signals:
     def __init__(self, rec: Recording) -> None:
         self.zero_ns = rec.start_ns or 0
         groups = {
-            c.topic: found
+            c.topic: panels
             for c in rec.channels.values()
-            if c.schema != EVENT and c.count and (found := panels_of(c))
+            if c.schema != EVENT and c.count and (panels := panels_of(c))
         }
         shown = _first(groups)
         order = [*dict.fromkeys(t for t, _ in shown), *groups]
         self.panels = [
             {**panel, "topic": topic, "open": (topic, panel["name"]) in shown}
-            for topic, found in groups.items()
-            for panel in found
+            for topic, panels in groups.items()
+            for panel in panels
         ]
         self.pyramids = {
             topic: Pyramid(
@@ -110,9 +110,9 @@ def panels_of(channel: Channel) -> list[dict[str, Any]]:
         ``name``, ``unit``, and ``columns``: each its ``column``, ``name``, ``factor`` from SI and ``color``.
     """
     panels: dict[tuple[str, str], dict[str, Any]] = {}
-    known = SCHEMAS.get(channel.schema)
-    kinds = {} if known is None else {c.name: c.kind for c in known.columns}
-    suffixes = () if known is None or not known.names else sorted(kinds, key=len, reverse=True)
+    schema = SCHEMAS.get(channel.schema)
+    kinds = {} if schema is None else {c.name: c.kind for c in schema.columns}
+    suffixes = () if schema is None or not schema.names else sorted(kinds, key=len, reverse=True)
     for column in channel.columns:
         suffix = next((s for s in suffixes if column.endswith(s)), column)
         if kinds.get(suffix, "number") not in ("number", "sigma", "flag"):
@@ -133,16 +133,18 @@ def panels_of(channel: Channel) -> list[dict[str, Any]]:
 
 def _first(groups: dict[str, list[dict[str, Any]]]) -> set[tuple[str, str]]:
     """Return topic and name of the panels that are open at first: of raw channels, the usual ones first."""
-    found = [
+    listed = [
         (topic, panel["name"])
         for name in (*FIRST_GROUPS, None)
         for topic, panels in groups.items()
         for panel in panels
         if (name is None or panel["name"] == name) and not topic.startswith("/estimate/")
     ]
-    names = [f[1] for f in found]
-    usual = [f for f in dict.fromkeys(found) if f[1] in FIRST_GROUPS]
+    names = [f[1] for f in listed]
+    usual = [f for f in dict.fromkeys(listed) if f[1] in FIRST_GROUPS]
     most = FIRST_PANELS
     if names.count("acc") > 2:  # several sensors: the same quantity of each tells more than all of one
         usual = [f for f in usual if f[1] == "acc"]
-    return set((usual or list(dict.fromkeys(found)) or [(t, p[0]["name"]) for t, p in groups.items()])[:most])
+    return set(
+        (usual or list(dict.fromkeys(listed)) or [(t, p[0]["name"]) for t, p in groups.items()])[:most]
+    )

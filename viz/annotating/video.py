@@ -62,5 +62,5 @@ def video_of(rec: Recording, path: Path | None = None, offset_s: float = 0.0) ->
         if attached.media_type.startswith("video/"):
             return Video(attached.name, rec.attachment(attached.name), offset_s)
     beside = (rec.path.with_suffix(s) for s in SUFFIXES)
-    found = next((p for p in beside if p.is_file()), None)
-    return None if found is None else Video(found.name, found, offset_s)
+    file = next((p for p in beside if p.is_file()), None)
+    return None if file is None else Video(file.name, file, offset_s)

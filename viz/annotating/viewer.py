@@ -71,8 +71,8 @@ def read_time_panel(client: Any, axis: TimeAxis) -> TimePanel:
     if zero is None:
         raise MarchaError(f"the viewer shows the time line {shown.current_timeline!r}; choose {SINCE_START}")
     cursor = shown.current_time
-    found = panel.get("TimePanelBlueprint", {})
-    selected = found.get("time_selection") if found.get("loop_mode") == "Selection" else None
+    properties = panel.get("TimePanelBlueprint", {})
+    selected = properties.get("time_selection") if properties.get("loop_mode") == "Selection" else None
     return TimePanel(
         None if cursor is None else zero + int(cursor),
         None if selected is None else (zero + int(selected["min"]), zero + int(selected["max"])),
@@ -167,9 +167,9 @@ class KeyMarking:
         """Return the labels of the tier: of its vocabulary, then others that it has."""
         from ...recording.events import vocabularies
 
-        known = vocabularies(self.session.rec.metadata).get(self.tier)
-        labels = list(known.labels) if known is not None else []
-        if known is None or not known.closed:
+        vocabulary = vocabularies(self.session.rec.metadata).get(self.tier)
+        labels = list(vocabulary.labels) if vocabulary is not None else []
+        if vocabulary is None or not vocabulary.closed:
             labels += sorted({r["label"] for r in self.session.rows.values() if r["tier"] == self.tier})
         return list(dict.fromkeys(labels))
 

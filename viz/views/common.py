@@ -54,9 +54,9 @@ class General(View):
         self.kinds: dict[str, str] | None = None  # known with the first rows
         self.lanes: dict[str, Lane] = {}
         schema = SCHEMAS.get(self.channel.schema)
-        known = {} if schema is None or schema.names else {c.name: c.kind for c in schema.columns}
-        if self.channel.columns and set(self.channel.columns) <= set(known):
-            self._prepare({c: known[c] for c in self.channel.columns})
+        kinds = {} if schema is None or schema.names else {c.name: c.kind for c in schema.columns}
+        if self.channel.columns and set(self.channel.columns) <= set(kinds):
+            self._prepare({c: kinds[c] for c in self.channel.columns})
 
     def _prepare(self, kinds: dict[str, str]) -> None:
         """Decide what each column is drawn as, and say where."""
@@ -81,12 +81,12 @@ class General(View):
                 count[units[c]] += 1
                 self.canvas.lines(f"{self.path}/{slug(c)}", [self.shown[c].name], [style.axis_color(place)])
                 panel = self._panel(c, head, units[c])
-                at = f"{self.path}/{slug(c)}"
-                self.canvas.show("plot", at, tab=self.tab, panel=panel, owner=self.owner)
+                entity_path = f"{self.path}/{slug(c)}"
+                self.canvas.show("plot", entity_path, tab=self.tab, panel=panel, owner=self.owner)
         for c in self.flags:
-            at = f"{self.path}/{slug(c)}"
-            self.lanes[c] = Lane(self.canvas, at)
-            self.canvas.show("lanes", at, tab=OVERVIEW, panel="lanes", owner=self.owner)
+            entity_path = f"{self.path}/{slug(c)}"
+            self.lanes[c] = Lane(self.canvas, entity_path)
+            self.canvas.show("lanes", entity_path, tab=OVERVIEW, panel="lanes", owner=self.owner)
         if self.texts:
             self.log = f"{self.canvas.prefix}/log{self.path.removeprefix(self.canvas.prefix)}"
             self.canvas.show("log", self.log, tab=REPORT, panel="texts", owner=self.owner)
@@ -228,11 +228,11 @@ class Values(View):
         self.lanes: dict[str, tuple[Lane, list[str]]] = {}
         for name in states:
             words = [printable(w.strip()) for w in labels[name].split(",")] if labels[name] else []
-            at = f"{self.path}/{slug(name)}"
+            entity_path = f"{self.path}/{slug(name)}"
             colors = {w: style.run_color(i) for i, w in enumerate(words) if w}
-            self.lanes[name] = (Lane(canvas, at, colors), words)
+            self.lanes[name] = (Lane(canvas, entity_path, colors), words)
             for tab in (OVERVIEW, self._tab()):
-                canvas.show("lanes", at, tab=tab, panel="lanes", owner=self.owner)
+                canvas.show("lanes", entity_path, tab=tab, panel="lanes", owner=self.owner)
         unit = metadata.get("unit", "")
         self.shown = {c: shown_as(c, unit) for c in columns if c not in self.lanes}
         self.highest = dict.fromkeys(self.shown, 0.0)
@@ -260,8 +260,8 @@ class Values(View):
             self.highest[name] = max(self.highest[name], float(finite.max(initial=0.0)))
         for name, (lane, words) in self.lanes.items():
             values = columns_of(block, [name])[:, 0]
-            found, codes = np.unique(values, return_inverse=True)
-            lane.add(t_ns, codes, [state_name(v, words) for v in found])
+            states, codes = np.unique(values, return_inverse=True)
+            lane.add(t_ns, codes, [state_name(v, words) for v in states])
 
     def end(self) -> None:
         for limit in thresholds_of(self.channel):

@@ -74,8 +74,8 @@ class Conditions(View):
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
         for statistic, lane in self.lanes.items():
             met = condition(statistic, block, self.channel.metadata)
-            known = np.isfinite(block[statistic].cast(pl.Float64).to_numpy())
-            lane.add(t_ns, np.where(known, met, 2).astype(np.int64), ("not met", "met", ""))
+            finite = np.isfinite(block[statistic].cast(pl.Float64).to_numpy())
+            lane.add(t_ns, np.where(finite, met, 2).astype(np.int64), ("not met", "met", ""))
 
     def end(self) -> None:
         for lane in self.lanes.values():

@@ -99,11 +99,11 @@ class Ranges(ByTransmitter):
     def _line(self, mac: str, t_ns: Times, values: np.ndarray) -> None:
         super()._line(mac, t_ns, values)
         anchor = self.canvas.plan.anchors.get(mac.lower()) if self.canvas.plan else None
-        known = np.isfinite(values) & (values > 0)
-        if anchor is None or not known.any():
+        usable = np.isfinite(values) & (values > 0)
+        if anchor is None or not usable.any():
             return
         # the range is along the slope: in the plane of the floor it is shorter by the anchor's height
-        flat = np.sqrt(np.maximum(values[known] ** 2 - anchor.position[2] ** 2, 0.0))
+        flat = np.sqrt(np.maximum(values[usable] ** 2 - anchor.position[2] ** 2, 0.0))
         centre = np.tile([*anchor.position[:2], 0.0], (len(flat), 1))
         strips = circle(centre, np.column_stack([flat, flat]))
-        self.canvas.columns(self._circle(mac), t_ns[known], rr.LineStrips3D.columns(strips=list(strips)))
+        self.canvas.columns(self._circle(mac), t_ns[usable], rr.LineStrips3D.columns(strips=list(strips)))

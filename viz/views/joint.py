@@ -116,8 +116,8 @@ class Attitudes(Values):
         super().begin()
         for name in self.shown:
             series_of(self.canvas)[self.channel.topic, name] = Curve()
-            at = f"{self.path}/{slug(name)}"
-            self.canvas.lines(at, [f"{self.owner} {name.replace('_', ' ')} (°)"], [self.color])
+            entity_path = f"{self.path}/{slug(name)}"
+            self.canvas.lines(entity_path, [f"{self.owner} {name.replace('_', ' ')} (°)"], [self.color])
 
     def _show(self, name: str, path: str, panel: str) -> None:
         segment, _, axis = name.rpartition("_")
@@ -147,14 +147,14 @@ def angle_reference(canvas: Canvas, channel: ChannelLike, joint: str) -> tuple[s
     A reference before an encoder, the same name before an only one.
     """
     for role in ("reference", "raw"):
-        found = [k for k in series_of(canvas) if role_of(k[0]) == role and k[0] != channel.topic]
-        same = [k for k in found if k[1] == joint]
+        candidates = [k for k in series_of(canvas) if role_of(k[0]) == role and k[0] != channel.topic]
+        same = [k for k in candidates if k[1] == joint]
         if same:
             return same[0]
-        found = [k for k in found if not k[1].endswith(AXIS_ENDS)]
+        candidates = [k for k in candidates if not k[1].endswith(AXIS_ENDS)]
         own = [k for k in series_of(canvas) if k[0] == channel.topic]
-        if len(found) == len(own) == 1 and not joint.endswith(AXIS_ENDS):
-            return found[0]
+        if len(candidates) == len(own) == 1 and not joint.endswith(AXIS_ENDS):
+            return candidates[0]
     return None
 
 
@@ -163,12 +163,12 @@ def difference(own: Curve, truth: Curve) -> tuple[Times, Floats]:
     t, v = own.finite()
     t_ref, v_ref = truth.finite()
     if len(t_ref) < len(t):  # the denser one is interpolated, at the times of the sparser one
-        found = match(t_ref, t, MAX_GAP_S)
-        at, error = t_ref[found.index], found.linear(v[:, None])[:, 0] - v_ref[found.index]
+        pairs = match(t_ref, t, MAX_GAP_S)
+        t_ns, error = t_ref[pairs.index], pairs.linear(v[:, None])[:, 0] - v_ref[pairs.index]
     else:
-        found = match(t, t_ref, MAX_GAP_S)
-        at, error = t[found.index], v[found.index] - found.linear(v_ref[:, None])[:, 0]
-    return at, (error + 180.0) % 360.0 - 180.0
+        pairs = match(t, t_ref, MAX_GAP_S)
+        t_ns, error = t[pairs.index], v[pairs.index] - pairs.linear(v_ref[:, None])[:, 0]
+    return t_ns, (error + 180.0) % 360.0 - 180.0
 
 
 class AngleSigma(Values):
@@ -260,8 +260,8 @@ class Orientation(View):
         label = rr.Points3D([ends[1] * 0.5], labels=[self.segment], colors=rgb, radii=0.005, show_labels=True)
         canvas.static(f"{self.at}/name", label)
         for part in ("bone", "axes", "name"):
-            at = f"{self.at}/{part}"
-            canvas.show("space", at, tab=JOINTS, panel=FIGURE, owner=self.owner)
+            entity_path = f"{self.at}/{part}"
+            canvas.show("space", entity_path, tab=JOINTS, panel=FIGURE, owner=self.owner)
 
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
         turn = columns_of(block, [f"quat_{a}" for a in "wxyz"])

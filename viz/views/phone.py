@@ -65,18 +65,18 @@ class Fix(General):
             self.line.append(place)
         if self.accuracy:
             sd = columns_of(block, SD)
-            known = np.isfinite(sd).all(axis=1) & (sd > 0).all(axis=1)
-            rings = geo_circle(place[known], sd[known])
+            stated = np.isfinite(sd).all(axis=1) & (sd > 0).all(axis=1)
+            rings = geo_circle(place[stated], sd[stated])
             columns = rr.GeoLineStrings.columns(line_strings=list(rings))
-            self.canvas.columns(self.circles, t_ns[known], columns)
+            self.canvas.columns(self.circles, t_ns[stated], columns)
 
     def end(self) -> None:
         super().end()
         if self.line:
             line = np.concatenate(self.line)
             if len(line) > 1:
-                at = f"{self.path}/map/track"
+                entity_path = f"{self.path}/map/track"
                 width = rr.Radius.ui_points(2.0)
                 track = rr.GeoLineStrings(lat_lon=[line], colors=style.rgb(self.color), radii=width)
-                self.canvas.static(at, track)
-                self.canvas.show("map", at, tab=OVERVIEW, panel=MAP, owner=self.owner)
+                self.canvas.static(entity_path, track)
+                self.canvas.show("map", entity_path, tab=OVERVIEW, panel=MAP, owner=self.owner)

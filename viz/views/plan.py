@@ -21,16 +21,16 @@ def draw_plan(canvas: Canvas) -> FloorPlan:
     if not plan:
         return plan
     canvas.flat = True
-    at = f"{canvas.prefix}/plan"
+    base = f"{canvas.prefix}/plan"
     if plan.outlines:
         strips = [np.column_stack([line, np.zeros(len(line))]).astype(np.float32) for line in plan.outlines]
-        path = f"{at}/outlines"
+        path = f"{base}/outlines"
         canvas.static(path, rr.LineStrips3D(strips, colors=LINE, radii=rr.Radius.ui_points(0.8)))
         canvas.show("space", path, tab=OVERVIEW, panel=SPACE, owner="plan")
     if plan.picture is not None:
         left, right, low, high = plan.corners
         corners = [(left, low), (right, low), (right, high), (left, high)]
-        path = f"{at}/picture"
+        path = f"{base}/picture"
         mesh = rr.Mesh3D(
             vertex_positions=[(x, y, -BELOW_M) for x, y in corners],
             triangle_indices=[(0, 1, 2), (0, 2, 3)],
@@ -40,7 +40,7 @@ def draw_plan(canvas: Canvas) -> FloorPlan:
         canvas.static(path, mesh)
         canvas.show("space", path, tab=OVERVIEW, panel=SPACE, owner="plan")
     if plan.anchors:
-        path = f"{at}/anchors"
+        path = f"{base}/anchors"
         anchors = list(plan.anchors.values())
         colors = technology_colors(a.technology for a in anchors)
         points = rr.Points3D(
@@ -57,5 +57,5 @@ def draw_plan(canvas: Canvas) -> FloorPlan:
 
 def technology_colors(technologies: object) -> dict[str, str]:
     """Return a colour by technology, in the order in which they are met."""
-    found = dict.fromkeys(str(t) for t in technologies)  # type: ignore[attr-defined]
-    return {t: style.run_color(i) for i, t in enumerate(found)}
+    names = dict.fromkeys(str(t) for t in technologies)  # type: ignore[attr-defined]
+    return {t: style.run_color(i) for i, t in enumerate(names)}

@@ -46,17 +46,17 @@ class Positions(View):
         if self.turns:
             canvas.static(f"{self.base}/foot", rr.TransformAxes3D(0.3))
         for part in ("track", "trail", "mark", *(["foot"] if self.turns else [])):
-            at, past = f"{self.base}/{part}", part == "trail"
-            canvas.show("space", at, tab=OVERVIEW, panel=SPACE, owner=self.owner, past=past)
+            entity_path, past = f"{self.base}/{part}", part == "trail"
+            canvas.show("space", entity_path, tab=OVERVIEW, panel=SPACE, owner=self.owner, past=past)
         panel = "height above the start (m)"
         canvas.show("plot", f"{self.base}/height", tab=OVERVIEW, panel=panel, owner=self.owner)
 
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
         canvas = self.canvas
         position = columns_of(block, POSITION)
-        known = np.isfinite(position[:, :2]).all(axis=1)
-        if not np.isfinite(position[known, 2]).any():
-            position[known, 2] = 0.0  # a position in the plane
+        placed_rows = np.isfinite(position[:, :2]).all(axis=1)
+        if not np.isfinite(position[placed_rows, 2]).any():
+            position[placed_rows, 2] = 0.0  # a position in the plane
         finite = np.isfinite(position).all(axis=1)
         if self.level is None and finite.any():
             self.level = float(position[finite][0, 2]) if self.role == "reference" else 0.0
@@ -94,13 +94,13 @@ class Positions(View):
             self._points(7.0)
         owners = list(canvas.traces) if self.base in canvas.traces else [self.base]
         # names stand at different places of the walk, so that those of several runs do not cover each other
-        at = len(line) * (owners.index(self.base) + 1) // (len(owners) + 1)
+        label_row = len(line) * (owners.index(self.base) + 1) // (len(owners) + 1)
         first = owners[0] == self.base
         closed = float(np.linalg.norm(line[-1] - line[0])) < CLOSED_M
         canvas.static(
             f"{self.base}/mark",
             rr.Points3D(
-                line[[0, at, -1]],
+                line[[0, label_row, -1]],
                 labels=["start" if first else "", self.name, "end" if first and not closed else ""],
                 colors=color,
                 radii=rr.Radius.ui_points([5.0, 0.0, 5.0]),

@@ -52,12 +52,12 @@ class AidedEstimator(FootEstimator):
 
     def remarks(self) -> list[Remark]:
         """Return the common remarks, and every aid that is on but did nothing."""
-        s, found = self.record, super().remarks()
+        s, remarks = self.record, super().remarks()
         p: Any = self.params
         aids = s.aids
         m, b = aids.magnetometer, aids.barometer
         if not aids.on or not s.started:
-            return found
+            return remarks
         for name, seen, used, kind in (
             ("magnetometer", m.seen, m.used, MAGNETIC_FIELD.schema),
             ("barometer", b.seen, b.used, FLUID_PRESSURE.schema),
@@ -72,19 +72,19 @@ class AidedEstimator(FootEstimator):
                     f"{m.refused} measurements were refused: norm or dip of the field is not the "
                     "start's; calibrate it, or widen mag_norm_max and mag_dip_max_deg"
                 )
-            found.append(Remark("aid_unused", f"{name} is on but did nothing: {why}"))
+            remarks.append(Remark("aid_unused", f"{name} is on but did nothing: {why}"))
         if aids.height.on and aids.height.used == 0 and aids.landings > 0:
-            found.append(
+            remarks.append(
                 Remark(
                     "aid_unused",
                     f"hupt is on but did nothing: all {aids.landings} steps climb by more than hupt_max_m",
                 )
             )
         if aids.straight.kind > NO_HEADING and aids.straight.used == 0 and aids.landings > 0:
-            found.append(
+            remarks.append(
                 Remark(
                     "aid_unused",
                     f"heading_aid is on but did nothing: never {p.straight_strides} strides straight on",
                 )
             )
-        return found
+        return remarks
