@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .. import recording as mr
 from ..recording.errors import MarchaError, UsageError
 from .anatomy import cluster_attitude
-from .clockfit import ClockFit, FloatArray, Pair, from_events, from_rates, given, turn_rate
+from .clockfit import ClockFit, FloatArray, Pair, from_events, from_rates, stated_fit, turn_rate
 from .leg import JOINTS, MARKERS_TOPIC, marker_names
 
 GYR = ("gyr_x", "gyr_y", "gyr_z")
@@ -59,7 +59,7 @@ def align(
     inertial, optical = _two_clocks(rec, clocks, source, segment)
     segments: list[str] = []
     if offset_s is not None:
-        fit = given(offset_s, drift_ppm)
+        fit = stated_fit(offset_s, drift_ppm)
     elif events:
         fit = from_events(events)
     else:

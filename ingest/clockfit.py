@@ -65,7 +65,7 @@ class Pair(NamedTuple):
     optical: FloatArray
 
 
-def given(offset_s: float, drift_ppm: float = 0.0) -> ClockFit:
+def stated_fit(offset_s: float, drift_ppm: float = 0.0) -> ClockFit:
     """Return what the user says."""
     nan = float("nan")
     return ClockFit("given", offset_s, drift_ppm, nan, nan, nan, nan)

@@ -146,7 +146,7 @@ class IndoorFingerprint(PlainEstimator):
     def _likely(self, numbers: Any, heard: FloatArray) -> tuple[FloatArray, FloatArray]:
         field = self.field
         assert field is not None
-        numbers, heard = numbers[field.known[numbers]], heard[field.known[numbers]]
+        numbers, heard = numbers[field.covered[numbers]], heard[field.covered[numbers]]
         e = heard[:, None] - field.mean[numbers]
         if self.params.remove_offset and len(numbers):
             e = e - e.mean(axis=0)

@@ -85,14 +85,14 @@ class RadioField:
         Points (m), shape (n, 2): all within reach of a surveyed place.
     mean, sd : ndarray
         dBm and dB, shape (transmitters, n).
-    known : ndarray of bool
+    covered : ndarray of bool
         Transmitters that enough places heard, shape (transmitters,).
     """
 
     grid: FloatArray
     mean: FloatArray
     sd: FloatArray
-    known: NDArray[np.bool_]
+    covered: NDArray[np.bool_]
 
 
 def field_of(where: FloatArray, powers: FloatArray) -> RadioField:
