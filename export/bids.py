@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -17,6 +18,7 @@ from ..recording import Recording
 from ..recording.errors import UsageError
 from ..recording.events import bids_events, events_text, sidecar, to_events
 from ..recording.selection import Selection, selected_topics, within
+from ..recording.threads import Prefetch
 from .facts import origin, pretty
 from .folder import whole_folder
 from .tables import EVENT, meaning
@@ -328,52 +330,33 @@ def _write_system(
     files: _Files, rec: Recording, options: BidsOptions, system: System, stem: str
 ) -> list[tuple[str, str, str, str]]:
     """Write one tracking system; return where each column comes from."""
-    first = last = count = 0
-    later = dict.fromkeys(system.topics, False)  # known later than measured
-    for tables in _rows(rec, system.topics, options):
-        t_ns = tables[0]["t_ns"]
-        first, last, count = first if count else t_ns[0], t_ns[-1], count + len(t_ns)
-        for topic, table in zip(system.topics, tables, strict=True):
-            later[topic] |= (table[KNOWN_AT] != table["t_ns"]).any()
+    path, later = files.place(f"{stem}_motion.tsv"), set[str]()
+    origin_of = _origins(rec, system, later)
+    while (times := _write_rows(rec, options, system, origin_of, path, later)) is None:
+        origin_of = _origins(rec, system, later)
+    first, last, count = times
     duration_ns = last - first
     rate = (count - 1) * 1e9 / duration_ns if duration_ns > 0 else 0.0
     rows = [("latency", "n/a", "LATENCY", "n/a", "s", "n/a", rate, "time since the start of the recording")]
-    origin_of: list[tuple[str, str, str, str]] = []  # name in the table, topic, column, kind of number
-    for topic in system.topics:
+    for name, topic, column, _ in origin_of:
         schema = rec.channels[topic].schema
-        types = rec.table(topic, start_ns=0, end_ns=0, log_time=True).schema
-        for column in [*numeric_columns(rec, topic), *([KNOWN_AT] if later[topic] else [])]:
-            group, _, axis = column.rpartition("_")
-            kind_of = _KINDS.get(group)
-            joint = schema == "sensor_msgs/msg/JointState"
-            kind = "JNTANG" if joint and not column.endswith((".vel", ".effort")) else kind_of or "MISC"
-            component = axis if axis in ("x", "y", "z") else "n/a"
-            if kind_of == "ORNT":
-                component = f"quat_{axis}"
-            about = meaning(schema, column)
-            if column == KNOWN_AT:
-                about = {"unit": "s", "meaning": "when it was known, since the start of the recording"}
-            unit = _UNITS.get(about["unit"], about["unit"])
-            frame = rec.channels[topic].frame_id or "n/a"
-            name = f"{topic.strip('/').replace('/', '_')}_{column}"
-            origin_of.append((name, topic, column, str(types[column])))
-            if column.endswith("_ns"):
-                unit = "s"
-            if kind == "ORNT":
-                unit = "n/a"
-            rows.append(
-                (name, component, kind, topic.strip("/"), unit, _frame(frame), rate, about["meaning"])
-            )
-    with files.place(f"{stem}_motion.tsv").open("wb") as file:
-        for tables in _rows(rec, system.topics, options):
-            by_topic = dict(zip(system.topics, tables, strict=True))
-            columns = [_seconds(tables[0]["t_ns"], rec).alias("latency")]
-            columns += [
-                _cells(by_topic[topic], column, rec).alias(name) for name, topic, column, _ in origin_of
-            ]
-            pl.DataFrame(columns).with_columns(pl.selectors.float().fill_nan(None)).write_csv(
-                file, separator="\t", include_header=False, null_value="n/a", float_scientific=None
-            )
+        group, _, axis = column.rpartition("_")
+        kind_of = _KINDS.get(group)
+        joint = schema == "sensor_msgs/msg/JointState"
+        kind = "JNTANG" if joint and not column.endswith((".vel", ".effort")) else kind_of or "MISC"
+        component = axis if axis in ("x", "y", "z") else "n/a"
+        if kind_of == "ORNT":
+            component = f"quat_{axis}"
+        about = meaning(schema, column)
+        if column == KNOWN_AT:
+            about = {"unit": "s", "meaning": "when it was known, since the start of the recording"}
+        unit = _UNITS.get(about["unit"], about["unit"])
+        frame = rec.channels[topic].frame_id or "n/a"
+        if column.endswith("_ns"):
+            unit = "s"
+        if kind == "ORNT":
+            unit = "n/a"
+        rows.append((name, component, kind, topic.strip("/"), unit, _frame(frame), rate, about["meaning"]))
     heads = [
         "name",
         "component",
@@ -414,6 +397,52 @@ def _write_system(
     }
     files.json(f"{stem}_motion.json", facts)
     return origin_of
+
+
+def _origins(rec: Recording, system: System, later: set[str]) -> list[tuple[str, str, str, str]]:
+    """Return name in the table, topic, column and kind of number of each column that is written."""
+    return [
+        (f"{topic.strip('/').replace('/', '_')}_{column}", topic, column, str(types[column]))
+        for topic in system.topics
+        for types in [rec.table(topic, start_ns=0, end_ns=0, log_time=True).schema]
+        for column in [*numeric_columns(rec, topic), *([KNOWN_AT] if topic in later else [])]
+    ]
+
+
+def _write_rows(
+    rec: Recording,
+    options: BidsOptions,
+    system: System,
+    origin_of: list[tuple[str, str, str, str]],
+    path: Path,
+    later: set[str],
+) -> tuple[int, int, int] | None:
+    """Write the rows of a tracking system.
+
+    Returns
+    -------
+    tuple of int or None
+        First and last time and the number of rows; None where a channel is known later than measured that is
+        not in ``later``: it is now, and has one more column.
+    """
+    first = last = count = 0
+    with closing(Prefetch(_rows(rec, system.topics, options), "export")) as rows, path.open("wb") as file:
+        for tables in rows:
+            by_topic = dict(zip(system.topics, tables, strict=True))
+            found = {t for t, table in by_topic.items() if (table[KNOWN_AT] != table["t_ns"]).any()}
+            if not found <= later:
+                later |= found
+                return None
+            t_ns = tables[0]["t_ns"]
+            first, last, count = first if count else t_ns[0], t_ns[-1], count + len(t_ns)
+            columns = [_seconds(t_ns, rec).alias("latency")]
+            columns += [
+                _cells(by_topic[topic], column, rec).alias(name) for name, topic, column, _ in origin_of
+            ]
+            pl.DataFrame(columns).with_columns(pl.selectors.float().fill_nan(None)).write_csv(
+                file, separator="\t", include_header=False, null_value="n/a", float_scientific=None
+            )
+    return first, last, count
 
 
 def _rows(rec: Recording, topics: Sequence[str], options: Selection) -> Iterator[tuple[pl.DataFrame, ...]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterator
+from contextlib import closing
 from hashlib import blake2b
 from itertools import chain
 from pathlib import Path
@@ -16,6 +17,7 @@ from ..recording import SCHEMAS, Channel, Recording
 from ..recording.events import COLUMNS as EVENT_COLUMNS
 from ..recording.events import events_text, sidecar, to_events
 from ..recording.selection import Selection, selected_topics, within
+from ..recording.threads import Prefetch
 from .facts import pretty
 from .folder import MARKER, whole_folder
 
@@ -90,7 +92,8 @@ class TableExporter:
     def _write_channel(self, stream: _Stream, file: Path, about: dict[str, str]) -> int:
         """Write one channel, return its rows; a full disk becomes an ``OSError``, whatever Polars says."""
         try:
-            self.write(stream, file, about)
+            with closing(stream):
+                self.write(stream, file, about)
         except (OSError, pl.exceptions.ComputeError) as error:
             if stream.failure is not None:
                 raise stream.failure from None
@@ -117,7 +120,11 @@ class CsvExporter(TableExporter):
 
 
 class ParquetExporter(TableExporter):
-    """Parquet, zstd, with topic, schema and frame in each file's own metadata."""
+    """Parquet with topic, schema and frame in each file's own metadata.
+
+    Snappy: read everywhere, and written in half the time of zstd, which makes files of noisy readings 10 to 20 %
+    smaller.
+    """
 
     name = "parquet"
     title = "folder of Parquet files, one a channel, with units in channels.json (Polars, pandas, DuckDB, R)"
@@ -125,7 +132,7 @@ class ParquetExporter(TableExporter):
 
     def write(self, stream: _Stream, file: Path, about: dict[str, str]) -> None:
         """Write one Parquet file."""
-        stream.frame.sink_parquet(file, metadata=about)
+        stream.frame.sink_parquet(file, compression="snappy", metadata=about)
 
 
 def _json_cell(value: Any) -> str:
@@ -134,7 +141,7 @@ def _json_cell(value: Any) -> str:
 
 
 class _Stream:
-    """A channel as a lazy stream of its windows.
+    """A channel as a stream of its windows, each read while the one before is written.
 
     Attributes
     ----------
@@ -145,13 +152,17 @@ class _Stream:
     """
 
     def __init__(self, rec: Recording, topic: str, options: Selection) -> None:
-        self._tables = _tables(rec, topic, options)
+        self._tables = Prefetch(_tables(rec, topic, options), "export")
         first = next(self._tables, None)
         if first is None:
             first = rec.table(topic, start_ns=0, end_ns=0, log_time=True)
         self._first = first
         self.rows = 0
         self.failure: BaseException | None = None
+
+    def close(self) -> None:
+        """Read no more."""
+        self._tables.close()
 
     @property
     def frame(self) -> pl.LazyFrame:
