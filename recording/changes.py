@@ -216,6 +216,8 @@ def undo(
     touched = _touched(entry)
     stands = standing(past)
     for later in past:
+        if later.action == "cut":
+            continue
         if later.number > first and not later.undoes and stands[later.number] and touched & _touched(later):
             raise UsageError(
                 f"{rec.path}: change {entry.number} cannot be taken back alone: change {later.number} "
@@ -224,7 +226,7 @@ def undo(
     if missing := set(entry.added) - set(rec.annotations["id"]):
         raise UsageError(
             f"{rec.path}: change {entry.number}: annotation {min(missing)} is no longer there; "
-            "another program took it out"
+            "it was cut off, or another program took it out"
         )
     rows = pl.DataFrame(list(entry.removed), schema=COLUMNS) if entry.removed else None
     words = {t: msgspec.json.decode(v, type=Vocabulary) if v else None for t, v in entry.vocabulary.items()}
@@ -258,6 +260,8 @@ def _chosen(rec: Recording, past: list[Change], number: int | None, *, redo: boo
     numbers = {c.number: c for c in past}
 
     def fits(entry: Change) -> bool:
+        if entry.action == "cut":  # what it took lies outside of the recording
+            return False
         first = numbers.get(entry.undoes)
         is_undo = first is not None and not first.undoes
         return stands[entry.number] and (is_undo if redo else not entry.undoes)

@@ -10,9 +10,10 @@ import msgspec
 import polars as pl
 
 from .annotations import EVENT
-from .changes import HISTORY
+from .changes import HISTORY, Change
 from .errors import UsageError
 from .events import SIDECAR, TABLE, VOCABULARY
+from .joins import Place, cut_history, history_text, joined_history
 from .provenance import source_file
 from .reader import Recording
 from .schemas import SCHEMAS
@@ -71,11 +72,11 @@ def cut(rec: Recording, out: Path | str, start_ns: int, end_ns: int, *, overwrit
         begins, ends = pl.col("start_ns"), pl.col("end_ns")
         ended = ends.is_between(begins, start_ns, closed="right")  # up to the cut: no instant of the part
         marks = rec.annotations.filter((ends >= start_ns) & (begins < end_ns) & ~ended)
-        file.add_annotations(
-            marks.with_columns(
-                pl.col("start_ns").clip(lower_bound=start_ns), pl.col("end_ns").clip(upper_bound=end_ns - 1)
-            )
+        marks = marks.with_columns(
+            pl.col("start_ns").clip(lower_bound=start_ns), pl.col("end_ns").clip(upper_bound=end_ns - 1)
         )
+        file.add_annotations(marks)
+        _add_history(file, cut_history(rec, marks))
         for name, values in rec.metadata.items():
             file.add_metadata(name, values)
         for attachment in rec.attachments:
@@ -104,7 +105,8 @@ def merge(
     offsets_ns : sequence of int, optional
         Added to all times of each: zero without it.
     prefixes : sequence of str, optional
-        Put before the topics of each: ``/anna`` makes ``/anna/foot/imu``. Empty without it.
+        Put before the topics of each: ``/anna`` makes ``/anna/foot/imu``, and ``/estimate/anna_<run>/…`` and
+        ``/reference/anna/…`` of estimates and references (:class:`Place`). Empty without it.
     overwrite : bool
         Whether ``out`` may be replaced.
 
@@ -130,27 +132,20 @@ def merge(
     with Writer(out, overwrite=overwrite) as file:
         ids: set[str] = set()
         taken: set[str] = set()
+        places: list[Place] = []
         vocabularies: dict[str, set[str]] = {}
         for number, (rec, offset, start) in enumerate(zip(recs, offsets, starts, strict=True), 1):
-            topics = [t for t, c in rec.channels.items() if c.schema != EVENT]
-            _copy(file, rec, topics, Selection(), offset, start)
-            tiers = f"{start.strip('/')}/" if start else ""
-            marks = rec.annotations.with_columns(
-                pl.col("start_ns", "end_ns") + offset,
-                id=pl.when(~pl.col("id").is_in(list(ids))).then("id"),
-                tier=pl.concat_str(pl.lit(tiers), "tier"),
-                channel=pl.when(pl.col("channel").is_in(list(rec.channels)))
-                .then(pl.concat_str(pl.lit(start), "channel"))
-                .otherwise("channel"),
-            )
-            for tier, words in rec.metadata.get(VOCABULARY, {}).items():
-                vocabularies.setdefault(tiers + tier, set()).add(words)
-            ids |= set(marks["id"].drop_nulls())
-            file.add_annotations(marks)
             name = _free(rec.path.stem, taken)
             taken.add(name)
+            place = Place(rec, start, offset, name, ids)
+            places.append(place)
+            topics = [t for t, c in rec.channels.items() if c.schema != EVENT]
+            _copy(file, rec, topics, Selection(), place)
+            file.add_annotations(place.marks())
+            for tier, words in rec.metadata.get(VOCABULARY, {}).items():
+                vocabularies.setdefault(place.tier(tier), set()).add(words)
             for key, values in rec.metadata.items():
-                file.add_metadata(f"{name}/{key}", values)
+                file.add_metadata(*place.record(key, values))
             for attachment in rec.attachments:
                 if attachment.name not in _EVENTS:
                     data = rec.attachment(attachment.name)
@@ -160,6 +155,7 @@ def merge(
         agreed = {tier: words.pop() for tier, words in vocabularies.items() if len(words) == 1}
         if agreed:  # what two recordings say differently stays below their names alone
             file.add_metadata(VOCABULARY, agreed)
+        _add_history(file, joined_history(places))
 
 
 def anonymize(
@@ -203,7 +199,7 @@ def anonymize(
                     left.append(f"channel {topic}: {key} = {value}")
     with Writer(out, overwrite=overwrite) as file:
         addresses: dict[str, str] = {}
-        _copy(file, rec, topics, Selection(), -rec.start_ns, "", addresses)
+        _copy(file, rec, topics, Selection(), Place(rec, "", -rec.start_ns, "", set()), addresses)
         if addresses:
             removed.append(f"{len(addresses)} hardware addresses: numbered")
         marks = rec.annotations
@@ -227,6 +223,8 @@ def anonymize(
             first, slash, rest = record.partition("/")
             name = f"{files[first]}/{rest}" if slash and first in files else record
             kept = {k: v for k, v in values.items() if not (_is_private(k) or _ORIGIN.search(name))}
+            if "records" in kept:  # of a run in a joined recording
+                kept["records"] = files.get(kept["records"], kept["records"])
             removed += [f"metadata {record}: {k}" for k in values if k not in kept]
             left += [f"metadata {name}: {k} = {v}" for k, v in kept.items()]
             if kept:
@@ -266,11 +264,11 @@ def _copy(
     rec: Recording,
     topics: Sequence[str],
     chosen: Selection,
-    offset_ns: int = 0,
-    prefix: str = "",
+    place: Place | None = None,
     addresses: dict[str, str] | None = None,
 ) -> None:
-    """Copy rows of channels, at other times, below a prefix, with numbers for hardware addresses."""
+    """Copy rows of channels, with the times and names of a place, with numbers for hardware addresses."""
+    place = place or Place(rec, "", 0, "", set())
     for topic in topics:
         about = rec.channels[topic]
         if about.schema not in SCHEMAS:
@@ -278,24 +276,31 @@ def _copy(
                 f"{rec.path}: {topic}: type {about.schema} cannot be written; leave the channel out"
             )
         metadata = {k: v for k, v in about.metadata.items() if addresses is None or not _is_private(k)}
-        metadata = {k: prefix + v if v in rec.channels else v for k, v in metadata.items()}
+        metadata = place.channel_metadata(metadata)
         columns = [c for c in about.columns if addresses is None or c != _OWN_CLOCK]
-        file.add_channel(prefix + topic, about.schema, about.frame_id, columns, metadata)
+        file.add_channel(place.topic(topic), about.schema, about.frame_id, columns, metadata)
     for window in rec.windows(topics, start_ns=chosen.start_ns, end_ns=chosen.end_ns):
         for topic, table in window.tables.items():
             if addresses is not None:
                 table = table.drop(_OWN_CLOCK, strict=False)
-            if offset_ns:
+            if place.offset_ns:
                 times = [c.name for c in SCHEMAS[rec.channels[topic].schema].columns if c.kind == "time"]
                 moved = {"t_ns", "t_log_ns", *times} - {_OWN_CLOCK}
-                table = table.with_columns(pl.col([c for c in table.columns if c in moved]) + offset_ns)
+                table = table.with_columns(pl.col([c for c in table.columns if c in moved]) + place.offset_ns)
             if addresses is not None and rec.channels[topic].schema in _RADIO:
                 for mac in table["mac"].unique(maintain_order=True).to_list():
                     addresses.setdefault(
                         mac, ":".join(f"{len(addresses):012x}"[k : k + 2] for k in range(0, 12, 2))
                     )
                 table = table.with_columns(pl.col("mac").replace(addresses))
-            file.add_table(prefix + topic, rec.channels[topic].schema, table)
+            file.add_table(place.topic(topic), rec.channels[topic].schema, table)
+
+
+def _add_history(file: Writer, changes: list[Change]) -> None:
+    """Attach the list of changes where there is one, and then the table of annotations too."""
+    if changes:
+        file.attach_events()
+        file.add_attachment(HISTORY, history_text(changes), "application/jsonl")
 
 
 def _parent(rec: Recording) -> dict[str, str]:

@@ -17,7 +17,7 @@ from .alignment import IntArray
 from .gaitcycles import JointCycles, cycles
 from .metrics import available_metrics
 from .metrics_joint import doubts
-from .references import KINDS, references, track_reference
+from .references import KINDS, own_record, references, track_reference
 from .trajectory import joined
 from .view import RunView, Truth
 
@@ -277,7 +277,8 @@ def recording_view(
     start_ns = start_ns if start_ns is not None else _number(lineage.get("range.start_ns"))
     end_ns = end_ns if end_ns is not None else _number(lineage.get("range.end_ns"))
     whole = start_ns is None and end_ns is None
-    facts = {**(rec.metadata.get("truth", {}) if rec is not None else {}), **(truth or {})}
+    stated = rec.metadata.get(own_record(lineage, "truth"), {}) if rec is not None else {}
+    facts = {**stated, **(truth or {})}
     topics = _track_references(rec, lineage.get("input", ""), reference) if rec is not None else (None, None)
     track, velocity = topics
     return RunView(

@@ -70,8 +70,8 @@ def reference_of(
         if chosen in fitting:
             return chosen
     parts = [p for p in input_topic.split("/") if p]
-    for i in range(len(parts) + 1):
-        own = [t for t in fitting if t.rpartition("/")[0] == "/".join(("", "reference", *parts[i:]))]
+    for called in _names(parts):
+        own = [t for t in fitting if t.rpartition("/")[0] == "/".join(("", "reference", *called))]
         own = [t for t in own if t.endswith(f"/{kind}")] or own
         if len(own) == 1:
             return own[0]
@@ -79,6 +79,24 @@ def reference_of(
     if len(fitting) > 1:
         raise UsageError(f"{name}: several references ({', '.join(fitting)}) for {input_topic}; name one")
     return fitting[0] if fitting else None
+
+
+def _names(parts: list[str]) -> list[list[str]]:
+    """Return what a reference may be called: the last parts of the input, or the first and the last, longest first.
+
+    The first parts are those that a recording got when it was joined with others: ``/reference/left/imu2`` for
+    ``/left/foot/imu2``.
+    """
+    names = [parts[:head] + parts[i:] for head in range(len(parts)) for i in range(head, len(parts) + 1)]
+    return sorted([*names, []], key=len, reverse=True)
+
+
+def own_record(lineage: Mapping[str, str], name: str) -> str:
+    """Return what the metadata record or attachment is called that speaks of a run: in a joined recording it
+    stands below the name of the run's own.
+    """
+    records = lineage.get("records")
+    return f"{records}/{name}" if records else name
 
 
 def track_reference(

@@ -17,7 +17,7 @@ import polars as pl
 
 from ..algorithms.contract import FloatArray
 from .alignment import IntArray, Matches, Transform, align, match, wrap
-from .references import reference_of, references
+from .references import own_record, reference_of, references
 from .trajectory import (
     POSITION,
     QUATERNION,
@@ -242,6 +242,7 @@ class RunView:
 
     def attachment(self, name: str) -> bytes | None:
         """Return an attachment of the recording; None where it is not there."""
+        name = own_record(self.lineage, name)
         if self.recording is None or name not in [a.name for a in self.recording.attachments]:
             return None
         return self.recording.attachment(name)

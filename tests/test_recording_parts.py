@@ -55,7 +55,7 @@ def test_two_parts_joined_are_the_whole(rec: Recording, tmp_path: Path) -> None:
 def test_an_offset_moves_every_time(rec: Recording, tmp_path: Path) -> None:
     merge([rec, rec], tmp_path / "d.mcap", offsets_ns=[0, 7 * S], prefixes=["", "/late"])
     both = mr.open(tmp_path / "d.mcap")
-    one, two = (both.table(t, log_time=True) for t in ("/estimate/mine/stance", "/late/estimate/mine/stance"))
+    one, two = (both.table(t, log_time=True) for t in ("/estimate/mine/stance", "/estimate/late_mine/stance"))
     assert_frame_equal(two, one.with_columns(pl.col("t_ns", "t_log_ns") + 7 * S))
     assert both.annotations["id"].n_unique() == 4
     assert (both.annotations["start_ns"].to_list()[0], both.annotations.height) == (START_NS + S, 4)

@@ -98,7 +98,7 @@ def test_joined_recordings_keep_both_parents_and_what_points_at_topics(
     for number, parent in ((1, rec), (2, other)):
         assert both.metadata[f"merge/{number}"]["source_blake2b"] == hash_file(parent.path)
         assert both.metadata[f"{parent.path.stem}/provenance"] == parent.metadata["provenance"]
-    assert both.channels["/r/estimate/a/pose"].metadata["input"] == "/r/foot/imu"
+    assert both.channels["/estimate/r_a/pose"].metadata["input"] == "/r/foot/imu"
     marks = both.annotations
     assert set(marks.filter(tier="r/walk of Eva")["channel"]) == {"/r/foot/imu"}
     assert marks.filter(tier="r/walk of Eva", label="inside")["start_ns"].to_list() == [ZERO + 2 * S]
