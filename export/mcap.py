@@ -19,7 +19,7 @@ from ..recording import (
 from ..recording.errors import MarchaError
 from ..recording.events import SIDECAR, TABLE
 from ..recording.selection import Selection, selected_topics, within
-from .pointclouds import add_tracks, is_track
+from .pointclouds import add_tracks
 from .rules import by_rules
 from .series import evenly
 
@@ -46,7 +46,7 @@ class McapOptions(Selection, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     tracks: Annotated[
         bool,
         msgspec.Meta(description="add every trajectory as one sensor_msgs/PointCloud2, which Rerun draws"),
-    ] = False
+    ] = True
 
 
 class McapExporter:
@@ -73,8 +73,6 @@ class McapExporter:
         topics = selected_topics(rec, options)
         data = [t for t in topics if rec.channels[t].schema != EVENT]
         kept = [t for t in data if options.estimates or not t.startswith(ESTIMATE)]
-        if options.tracks:  # drawn anew
-            kept = [t for t in kept if not is_track(rec, t)]
         with create(path, overwrite=overwrite) as out:
             if options.whole and not options.rate_hz:
                 tiers = [t for t, c in rec.channels.items() if options.annotations and c.schema == EVENT]

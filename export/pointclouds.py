@@ -10,11 +10,8 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ..recording import Recording, Writer
-from ..recording.selection import Selection
+from ..recording.selection import CLOUD, DRAWN, TRACK, Selection
 
-CLOUD = "sensor_msgs/msg/PointCloud2"
-TRACK = "/track"
-"""What stands before the topic of a trajectory in the topic of its points."""
 ROOT = "tf#/"
 """Rerun's name of the frame that every 3D view shows; a cloud in another one needs a path of transforms."""
 FRAMES = "/tf_static"
@@ -65,11 +62,6 @@ def add_tracks(rec: Recording, topics: Sequence[str], options: Selection, out: W
         _add_frames({name: first for name, first in frames.items() if name and name != ROOT}, out)
 
 
-def is_track(rec: Recording, topic: str) -> bool:
-    """Return whether :func:`add_tracks` wrote a channel."""
-    return topic.startswith(f"{TRACK}/") and rec.channels[topic].schema == CLOUD
-
-
 def _add_frames(frames: dict[str, int], out: Writer) -> None:
     """Write static transforms, the identity, from the viewer's root to frames given with their first times."""
     if not frames:
@@ -81,7 +73,7 @@ def _add_frames(frames: dict[str, int], out: Writer) -> None:
         parent_frame_id=pl.lit(ROOT),
         **{k: pl.lit(v) for k, v in values.items()},
     )
-    out.add_table(FRAMES, "tf2_msgs/msg/TFMessage", table)
+    out.add_table(FRAMES, "tf2_msgs/msg/TFMessage", table, metadata={DRAWN: "true"})
 
 
 def _message(cloud: NDArray[Any], t_ns: int) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from .joins import Place, cut_history, history_text, joined_history
 from .provenance import source_file
 from .reader import Recording
 from .schemas import SCHEMAS
-from .selection import Selection, selected_topics
+from .selection import Selection, is_drawn, selected_topics
 from .writer import Writer
 
 _ORIGIN = re.compile(r"(^|/)(provenance|(cut|export)(_\d+)?|merge/\d+)$")
@@ -126,7 +126,7 @@ def merge(
     for rec, start in zip(recs, starts, strict=True):
         for topic, channel in rec.channels.items():
             name = start + topic
-            if channel.schema != EVENT and name in seen:
+            if channel.schema != EVENT and name in seen and not is_drawn(rec, topic):
                 raise UsageError(f"{rec.path}: {name}: is in {seen[name]} too; give each its --prefix")
             seen[name] = rec.path
     with Writer(out, overwrite=overwrite) as file:
@@ -139,7 +139,7 @@ def merge(
             taken.add(name)
             place = Place(rec, start, offset, name, ids)
             places.append(place)
-            topics = [t for t, c in rec.channels.items() if c.schema != EVENT]
+            topics = [t for t in selected_topics(rec, Selection()) if rec.channels[t].schema != EVENT]
             _copy(file, rec, topics, Selection(), place)
             file.add_annotations(place.marks())
             for tier, words in rec.metadata.get(VOCABULARY, {}).items():
@@ -180,7 +180,7 @@ def anonymize(
     removed, left = [f"dates: times begin at 0 instead of {rec.start_ns} ns"], []
     topics = []
     for topic, channel in rec.channels.items():
-        if channel.schema == EVENT:
+        if channel.schema == EVENT or is_drawn(rec, topic):
             continue
         if channel.schema == _FIX and not keep_fixes:
             removed.append(f"{topic}: {channel.count} fixes")

@@ -13,6 +13,9 @@ from .errors import UsageError
 if TYPE_CHECKING:
     from .reader import Recording
 
+CLOUD, TRACK, DRAWN = "sensor_msgs/msg/PointCloud2", "/track", "drawn"
+"""Type and beginning of the topics of drawn trajectories; key of a channel's metadata that says it was drawn."""
+
 
 class Selection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Options of everything that takes a part of a recording."""
@@ -32,8 +35,14 @@ class Selection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         return self.start_ns is None and self.end_ns is None
 
 
+def is_drawn(rec: Recording, topic: str) -> bool:
+    """Return whether a channel only shows another one to viewers: an export draws it anew, nothing else needs it."""
+    channel = rec.channels[topic]
+    return DRAWN in channel.metadata or (channel.schema == CLOUD and topic.startswith(f"{TRACK}/"))
+
+
 def selected_topics(rec: Recording, selection: Selection) -> list[str]:
-    """Return the topics that a selection means, in the order of the recording.
+    """Return the topics that a selection means, in the order of the recording; drawn ones are never among them.
 
     Raises
     ------
@@ -54,9 +63,10 @@ def selected_topics(rec: Recording, selection: Selection) -> list[str]:
             raise UsageError(
                 f"{rec.path}: no topic fits {pattern!r}; it has {', '.join(rec.channels) or 'no channels'}"
             )
+    topics = [t for t in rec.channels if not is_drawn(rec, t)]
     if not selection.topics:
-        return list(rec.channels)
-    return [t for t in rec.channels if any(fnmatchcase(t, pattern) for pattern in selection.topics)]
+        return topics
+    return [t for t in topics if any(fnmatchcase(t, pattern) for pattern in selection.topics)]
 
 
 def within(annotations: pl.DataFrame, selection: Selection) -> pl.DataFrame:

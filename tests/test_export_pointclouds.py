@@ -10,6 +10,7 @@ import polars as pl
 import pytest
 from marcha.export import export
 from marcha.export.pointclouds import CLOUD, ROOT, TRACK
+from marcha.recording.parts import cut, merge
 from mcap_ros2.reader import read_ros2_messages
 from numpy.typing import NDArray
 from rerun.chunk import McapReader
@@ -102,6 +103,21 @@ def test_drawn_again_is_drawn_once(rec: mr.Recording) -> None:
     assert again.channels[BARE].columns == ("pos_x", "pos_y", "pos_z")
 
 
-def test_nothing_is_drawn_unasked(rec: mr.Recording) -> None:
-    export(rec, "mcap", rec.path.with_name("out.mcap"))
+def test_nothing_is_drawn_where_it_is_not_wanted(rec: mr.Recording) -> None:
+    export(rec, "mcap", rec.path.with_name("out.mcap"), options={"tracks": False})
     assert list(mr.open(rec.path.with_name("out.mcap")).channels) == list(rec.channels)
+
+
+def test_what_is_drawn_stays_behind_where_a_recording_is_taken_apart(
+    rec: mr.Recording, tmp_path: Path
+) -> None:
+    """It shows other channels: parts, joins and other formats take those, and the next export draws anew."""
+    shown = mr.open(drawn(rec))
+    cut(shown, tmp_path / "part.mcap", rec.start_ns + 100_000_000, rec.end_ns + 1)
+    merge([shown, shown], tmp_path / "both.mcap", prefixes=["", "/again"])
+    assert list(mr.open(tmp_path / "part.mcap").channels) == list(rec.channels)
+    assert sum(t.startswith(TRACK) for t in mr.open(tmp_path / "both.mcap").channels) == 0
+    export(shown, "csv", tmp_path / "csv")
+    assert not [p for p in (tmp_path / "csv").iterdir() if "track" in p.name or "tf" in p.name]
+    part = mr.open(drawn(mr.open(tmp_path / "part.mcap"), "again.mcap"))
+    assert part.channels[TRACK + POSED].count == 1
