@@ -429,9 +429,9 @@ def _write_rows(
     with closing(Prefetch(_rows(rec, system.topics, options), "export")) as rows, path.open("wb") as file:
         for tables in rows:
             by_topic = dict(zip(system.topics, tables, strict=True))
-            found = {t for t, table in by_topic.items() if (table[KNOWN_AT] != table["t_ns"]).any()}
-            if not found <= later:
-                later |= found
+            late_ones = {t for t, table in by_topic.items() if (table[KNOWN_AT] != table["t_ns"]).any()}
+            if not late_ones <= later:
+                later |= late_ones
                 return None
             t_ns = tables[0]["t_ns"]
             first, last, count = first if count else t_ns[0], t_ns[-1], count + len(t_ns)

@@ -20,7 +20,7 @@ ESTIMATE, REFERENCE, DEVICE = "/estimate/", "/reference/", "/reference/device/"
 RUN = "run/"
 
 
-class Place:
+class JoinedPart:
     """One recording's place in a joined one: what its topics, runs, tiers, ids and times are there.
 
     A prefix ``/left`` makes ``/left/foot/imu`` of a reading, ``/estimate/left_<run>/pose`` of an estimate and
@@ -115,7 +115,7 @@ class Place:
         ]
 
 
-def _renamed(rows: pl.DataFrame, place: Place) -> pl.DataFrame:
+def _renamed(rows: pl.DataFrame, place: JoinedPart) -> pl.DataFrame:
     """Return annotations with the times, ids, tiers and channels that they have in the joined recording."""
 
     def by(column: str, new: Any) -> pl.Series:
@@ -130,7 +130,7 @@ def _renamed(rows: pl.DataFrame, place: Place) -> pl.DataFrame:
     )
 
 
-def joined_history(places: Sequence[Place]) -> list[Change]:
+def joined_history(places: Sequence[JoinedPart]) -> list[Change]:
     """Return the changes of all as one list: by time, each recording's in their own order, numbered anew."""
     numbers: dict[tuple[int, int], int] = {}
     out: list[Change] = []

@@ -13,7 +13,7 @@ from .annotations import EVENT
 from .changes import HISTORY, Change
 from .errors import UsageError
 from .events import SIDECAR, TABLE, VOCABULARY
-from .joins import Place, cut_history, history_text, joined_history
+from .joins import JoinedPart, cut_history, history_text, joined_history
 from .provenance import source_file
 from .reader import Recording
 from .schemas import SCHEMAS
@@ -106,7 +106,7 @@ def merge(
         Added to all times of each: zero without it.
     prefixes : sequence of str, optional
         Put before the topics of each: ``/anna`` makes ``/anna/foot/imu``, and ``/estimate/anna_<run>/…`` and
-        ``/reference/anna/…`` of estimates and references (:class:`Place`). Empty without it.
+        ``/reference/anna/…`` of estimates and references (:class:`JoinedPart`). Empty without it.
     overwrite : bool
         Whether ``out`` may be replaced.
 
@@ -132,12 +132,12 @@ def merge(
     with Writer(out, overwrite=overwrite) as file:
         ids: set[str] = set()
         taken: set[str] = set()
-        places: list[Place] = []
+        places: list[JoinedPart] = []
         vocabularies: dict[str, set[str]] = {}
         for number, (rec, offset, start) in enumerate(zip(recs, offsets, starts, strict=True), 1):
             name = _free(rec.path.stem, taken)
             taken.add(name)
-            place = Place(rec, start, offset, name, ids)
+            place = JoinedPart(rec, start, offset, name, ids)
             places.append(place)
             topics = [t for t in selected_topics(rec, Selection()) if rec.channels[t].schema != EVENT]
             _copy(file, rec, topics, Selection(), place)
@@ -199,7 +199,7 @@ def anonymize(
                     left.append(f"channel {topic}: {key} = {value}")
     with Writer(out, overwrite=overwrite) as file:
         addresses: dict[str, str] = {}
-        _copy(file, rec, topics, Selection(), Place(rec, "", -rec.start_ns, "", set()), addresses)
+        _copy(file, rec, topics, Selection(), JoinedPart(rec, "", -rec.start_ns, "", set()), addresses)
         if addresses:
             removed.append(f"{len(addresses)} hardware addresses: numbered")
         marks = rec.annotations
@@ -264,11 +264,11 @@ def _copy(
     rec: Recording,
     topics: Sequence[str],
     chosen: Selection,
-    place: Place | None = None,
+    place: JoinedPart | None = None,
     addresses: dict[str, str] | None = None,
 ) -> None:
     """Copy rows of channels, with the times and names of a place, with numbers for hardware addresses."""
-    place = place or Place(rec, "", 0, "", set())
+    place = place or JoinedPart(rec, "", 0, "", set())
     for topic in topics:
         about = rec.channels[topic]
         if about.schema not in SCHEMAS:
