@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from ..recording.errors import MarchaError, UsageError
 from .contract import ReportBuilder
-from .mapping import CellSource, Topic
 
 FloatArray = NDArray[np.float64]
 
@@ -83,11 +82,6 @@ def plain_name(text: str) -> str:
     """Return a device's or file's name as part of a topic."""
     name = re.sub(r"\W+", "_", text).strip("_").lower()
     return name if name[:1].isalpha() else f"imu_{name}"
-
-
-def vector_topic(name: str, schema: str, columns: dict[str, CellSource | str | int], **more: object) -> Topic:
-    """Return a topic of a mapping; shorthand."""
-    return Topic(name=name, schema=schema, columns=columns, **more)  # pyright: ignore[reportArgumentType]
 
 
 def note_arbitrary(report: ReportBuilder, topics: Iterable[str], field_ut: float) -> None:
@@ -165,11 +159,6 @@ def unseen(
 def marker_names(columns: Iterable[str]) -> list[str]:
     """Return the markers of a table's columns (``knee.x`` …)."""
     return [c.removesuffix(".x") for c in columns if c.endswith(".x")]
-
-
-def marker_columns(names: Sequence[str], first: int) -> dict[str, CellSource | str | int]:
-    """Return the mapping of markers whose x, y, z stand one after the other from column ``first`` (from 1)."""
-    return {f"{n}.{a}": first + 3 * k + j for k, n in enumerate(names) for j, a in enumerate("xyz")}
 
 
 def unique_markers(names: Sequence[str], path: Path, line: int) -> list[str]:

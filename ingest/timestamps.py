@@ -93,11 +93,6 @@ class TimestampRepair:
         self._where: list[int | None] = [None, None]
         self._counts = [0, 0]
 
-    @property
-    def nominal_ns(self) -> int | None:
-        """Usual interval of the first block, in nanoseconds; None before two rows were seen."""
-        return None if self._nominal is None else self._nominal * self._tick_ns
-
     def stream(self, frames: Iterable[pl.DataFrame]) -> Iterator[pl.DataFrame]:
         """Feed all of ``frames`` and yield what is settled, to the end; empty frames are left out."""
         empty: pl.DataFrame | None = None

@@ -97,11 +97,6 @@ class Schema(msgspec.Struct, frozen=True):
         """Columns that every table has; none in a named schema."""
         return () if self.names else tuple(c.name for g in self.groups if not g.optional for c in g.columns)
 
-    @property
-    def fixed_size(self) -> bool:
-        """Whether all messages of a channel have one size, so that blocks are encoded at once."""
-        return not any(c.kind == "text" for c in self.columns) and not self.explode
-
 
 def declared_columns(schema: Schema, text: str) -> tuple[str, ...] | None:
     """Return the columns that a channel's metadata declare; None where they are not those of its messages."""

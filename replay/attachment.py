@@ -12,8 +12,8 @@ The rule, in this order, for every input:
    The first required input decides about the device: without a name every fitting channel makes a run of its
    own. A further input takes the only fitting channel that is nearest to it: of the same device (``/phone/mag``
    beside ``/phone/imu``), else of the same body (``/leg/encoder`` beside ``/leg/thigh/imu``). Two inputs that
-   ask for the same never share a channel; where as many channels fit as there are such inputs, they are taken
-   in the order of the recording, and the run says so. A calibration's input that reads a reference takes one
+   ask for the same never share a channel; where as many channels are left as there are such inputs, they are
+   taken in the order of the recording, and the run says so. A calibration's input that reads a reference takes one
    below ``/reference/`` instead.
 4. Where this does not decide, a required input is an error that lists the candidates, an optional one stays
    empty and the run says so.
@@ -21,7 +21,7 @@ The rule, in this order, for every input:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from ..algorithms.contract import ALL_COLUMNS, Input
@@ -166,14 +166,24 @@ def attach(
         candidates = (device and _nearest(candidates, device)) or candidates
         if not candidates:
             raise UsageError(_nothing_fits(first, name, source, chosen))
+        partners = {t for i in inputs if _same_request(i, first) for t in chosen.roles.get(i.name, ())}
+        own_side = f"{_side_of(partners)}_{first.name}"
+        candidates = [c for c in candidates if c.topic not in partners]
+        candidates = [c for c in candidates if partners and own_side in c.topic.split("/")] or candidates
         alike = [i for i in inputs if _same_request(i, first) and i.name not in fixed and not i.optional]
-        sides = _sides(alike, source, chosen)
+        if partners and len(alike) == 1 and not first.many and len(candidates) != 1:
+            topics = ", ".join(c.topic for c in candidates) or "no other"
+            raise UsageError(
+                f"{source.name}: input {first.name} of {name} beside {', '.join(sorted(partners))}: there are "
+                f"{topics}; name it with --input {first.name}=TOPIC"
+            )
+        sides = [] if partners else _sides(alike, source, chosen)
         if first.many:
             groups = [{first.name: tuple(candidates)}]
         elif sides:
             groups = [{i.name: (own[i.name],) for i in alike} for own in sides]
         elif len(alike) > 1:
-            groups = [_together(alike, candidates, name, source, chosen, notes)]
+            groups = [_together(alike, partners, name, source, chosen, notes)]
         else:
             groups = [{first.name: (c,)} for c in candidates]
     return [_complete(inputs, name, source, chosen, fixed | group, device, notes) for group in groups]
@@ -273,17 +283,17 @@ def _side_of(topics: Iterable[str]) -> str:
 
 def _together(
     alike: Sequence[Input],
-    candidates: Sequence[PlannedChannel],
+    partners: Collection[str],
     name: str,
     source: Source,
     chosen: NamedChannels,
     notes: list[Finding],
 ) -> dict[str, tuple[PlannedChannel, ...]]:
-    """Give each of several inputs that ask for the same a channel of its own."""
+    """Give each of several inputs that ask for the same a channel of its own; ``partners`` are given away."""
     group: dict[str, tuple[PlannedChannel, ...]] = {}
-    pool = _candidates(
-        Input("", alike[0].schema, alike[0].columns), source, chosen, only_named=True
-    )  # the first input's name must not hide the channels of the others
+    # without a name: that of the first input must not hide the channels of the others
+    pool = _candidates(Input("", alike[0].schema, alike[0].columns), source, chosen, only_named=True)
+    pool = [c for c in pool if c.topic not in partners]
     for need in alike:
         by_role = [c for c in pool if need.name in c.topic.split("/")]
         if len(by_role) == 1:
@@ -292,7 +302,7 @@ def _together(
     rest = [n for n in alike if n.name not in group]
     left = [c for c in pool if c.topic not in taken]
     if rest and len(rest) != len(left):
-        topics = ", ".join(c.topic for c in candidates if c.topic not in taken) or "none"
+        topics = ", ".join(c.topic for c in left) or "none"
         roles = ", ".join(n.name for n in rest)
         raise UsageError(
             f"{source.name}: estimator {name} reads {len(rest)} channels of {alike[0].schema} together "

@@ -198,15 +198,6 @@ class RunView:
             {name: tuple(topics) for name, topics in topics_of.items()} if isinstance(topics_of, dict) else {}
         )
 
-    @property
-    def output_schemas(self) -> dict[str, str]:
-        """Message types by the name of the run's output, where a recording holds them."""
-        if self.recording is None:
-            return {}
-        start = f"/estimate/{self.run}/"
-        channels = self.recording.channels.items()
-        return {t.removeprefix(start): c.schema for t, c in channels if t.startswith(start)}
-
     def raw(self, topic: str) -> pl.DataFrame | None:
         """Return a channel of the recording within the interval; None where it is not there."""
         if self.recording is None or topic not in self.recording.channels:

@@ -235,6 +235,22 @@ def test_roles_are_named_by_the_user() -> None:
     assert run.topics == {"a": ("/foot/imu2",), "b": ("/foot/imu1",)}
 
 
+def test_the_partner_of_a_named_channel_is_another_one() -> None:
+    (run,) = plan_runs(two_imus(), [Pair()], inputs=["a=/foot/imu1"])
+    assert run.topics == {"a": ("/foot/imu1",), "b": ("/foot/imu2",)}
+    three = source(("/x/imu", IMU, ACC), ("/y/imu", IMU, ACC), ("/z/imu", IMU, ACC))
+    with pytest.raises(UsageError, match=r"/y/imu, /z/imu; name it with --input b=TOPIC"):
+        plan_runs(three, [Pair()], inputs=["a=/x/imu"])
+    with pytest.raises(UsageError, match="no other"):
+        plan_runs(source(("/x/imu", IMU, ACC)), [Pair()], inputs=["a=/x/imu"])
+
+
+def test_the_partner_of_a_named_channel_is_of_its_side() -> None:
+    legs = source(*((f"/leg/{s}_{i}/imu", IMU, ACC) for s in ("left", "right") for i in "ab"))
+    (run,) = plan_runs(legs, [Pair()], inputs=["a=/leg/right_a/imu"])
+    assert run.topics == {"a": ("/leg/right_a/imu",), "b": ("/leg/right_b/imu",)}
+
+
 def test_a_choice_by_order_is_said() -> None:
     (run,) = plan_runs(two_imus(), [Pair()])
     assert [f.kind for f in run.findings] == ["attached_by_order"]

@@ -34,13 +34,6 @@ FLOOR = "floor"
 OF_EVERY_STEP = ("stance", "swing", "step")
 """Tiers that a replay or a rule writes for every step: too short to measure each."""
 UNIX_NS = 946_684_800 * 10**9
-GAIT_UNITS = {
-    "strides": "",
-    "steps": "",
-    "cadence_per_min": "steps/min",
-    "speed_m_s": "m/s",
-    "stance_share": "",
-}
 
 
 class Measured(NamedTuple):

@@ -73,7 +73,6 @@ CORE: Fields = [
     ("decided", "i8"),  # row up to which the detector's stages have come; runs past the end in a flush
     ("released", "i8"),  # samples handed to the filter
     ("time", "f8"),  # s since the first row, at the newest row
-    ("time_out", "f8"),  # the same at the released sample
     ("repaired", "i8"),  # rows with a value that was not finite (held)
     ("lowest", "f8", (6,)),  # of acceleration and angular rate
     ("highest", "f8", (6,)),
@@ -177,7 +176,6 @@ def release(s: Any, ring: Any) -> Any:
     """Count the next sample as released and return it."""
     r = ring[s.released & (ring.shape[0] - 1)]
     s.released += 1
-    s.time_out += r.dt
     s.stance_s = s.stance_s + r.dt if r.still else 0.0
     return r
 

@@ -36,11 +36,6 @@ def distance_m(power: ArrayLike, p_d0_dbm: ArrayLike, eta: ArrayLike) -> FloatAr
     return np.asarray(10.0 ** ((np.asarray(p_d0_dbm) - np.asarray(power)) / (10.0 * np.asarray(eta))))
 
 
-def distance_sigma_m(distance: ArrayLike, eta: ArrayLike, sigma_db: ArrayLike) -> FloatArray:
-    """Return the standard deviation of a range (m) whose power has ``sigma_db``, to first order."""
-    return np.asarray(distance) * math.log(10.0) / (10.0 * np.asarray(eta)) * np.asarray(sigma_db)
-
-
 def plane_range_m(slope_range_m: ArrayLike, height_difference_m: ArrayLike) -> FloatArray:
     """Return the range in the plane of one along the slope, 0 where that is shorter than the height."""
     square = np.asarray(slope_range_m) ** 2 - np.asarray(height_difference_m) ** 2

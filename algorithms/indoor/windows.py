@@ -11,7 +11,7 @@ import numpy as np
 from ..contract import FloatArray, Remark
 from ..parameters import meta
 from .anchors import Anchors
-from .lateration import Correction, corrected, flatness, least_squares, mean_of_triples
+from .lateration import corrected, flatness, least_squares, mean_of_triples
 from .pathloss import distance_m, plane_range_m
 
 SOURCE = "hybrid indoor positioning"
@@ -180,6 +180,3 @@ class Windows:
                 Remark("bad_power", f"{count} powers are not negative dBm above the least; left out")
             )
         return remarks
-
-
-CORRECTIONS: tuple[Correction, ...] = ("none", "votes", "both")

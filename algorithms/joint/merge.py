@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..contract import FloatArray, IntArray
+from ..contract import FloatArray
 from ..numerics.compiled import compiled
 
 SEGMENTS = ("trunk", "thigh", "shank", "foot")
@@ -221,15 +221,3 @@ def advance(s: Any) -> bool:
             s.due += 1
             return give(s)
     return s.ending == 1 and give(s)
-
-
-@compiled
-def clear_result(out: FloatArray) -> None:
-    """Set a result vector to NaN."""
-    for i in range(out.shape[0]):
-        out[i] = float("nan")
-
-
-def times_of(state: Any) -> IntArray:
-    """Return, of a packed state, how many samples each stream missed, shape (5,)."""
-    return state["missed"][0]

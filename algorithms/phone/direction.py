@@ -30,7 +30,6 @@ FIELDS: list[tuple[Any, ...]] = [
     ("power", "f8", (3,)),  # xx, xy, yy of the horizontal force in the device's heading frame
     ("fore", "f8", (2,)),  # correlation with the rise of the vertical force
     ("offset", "f8"),
-    ("elongation", "f8"),
     ("offset_n", "i8"),
     ("gyro_yaw", "f8"),
     ("gyro_ns", "i8"),
@@ -190,5 +189,3 @@ def _shaken(s: Any, first: int, last: int) -> None:
     if fore < (-ABOUT_FACE if s.offset_n > SETTLED else 0.0):
         axis += math.pi
     s.offset = attitude.wrap(axis)
-    spread = math.sqrt((s.power[0] - s.power[2]) ** 2 + 4.0 * s.power[1] ** 2)
-    s.elongation = spread / max(s.power[0] + s.power[2], 1e-12)

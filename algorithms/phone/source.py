@@ -128,18 +128,3 @@ def source_headings(mag: FloatArray, window: int = 20, *, centred: bool = True) 
     before = window // 2 if centred else window - 1
     after = window - 1 - before
     return np.array([np.median(h[max(0, i - before) : i + after + 1]) for i in range(len(h))])
-
-
-def source_track(length_m: FloatArray, heading_rad: FloatArray) -> FloatArray:
-    """Return east and north (m) at the end of every step by eq 3.20, shape (n, 2).
-
-    Parameters
-    ----------
-    length_m : ndarray
-        Of the steps, shape (n,).
-    heading_rad : ndarray
-        H, clockwise from north, shape (n,).
-    """
-    return np.cumsum(
-        np.column_stack((length_m * np.sin(heading_rad), length_m * np.cos(heading_rad))), axis=0
-    )

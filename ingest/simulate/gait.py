@@ -162,7 +162,7 @@ class GaitModel:
         stretch = 1.0 if style.stance_share == STANCE_SHARE else (1.0 - style.stance_share) / moving
         shares = tuple(stretch * share for share in self.SHARES)
         off, swing, slap = shares if style.heel_toe_roll else (0.0, sum(shares), 0.0)
-        self._off, self._swing, self._slap, self._moving = off, swing, slap, off + swing + slap
+        self._off, self._swing, self._moving = off, swing, off + swing + slap
         rides = np.zeros(len(durations)) if rides is None else rides
         waits = np.where(rides != 0.0, ride_s + 2 * DOORS_S, 0.0)
         self.lift_s = (
