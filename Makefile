@@ -33,6 +33,7 @@ bench: $(VENV)/.stamp-dev
 
 $(VENV)/.stamp: pyproject.toml
 	$(PYTHON) -c "import sys; sys.exit('marcha needs Python 3.11 or newer; set PYTHON=python3.x' if sys.version_info < (3, 11) else 0)"
+	@echo "setting up $(VENV), once: some minutes without a word"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -q --upgrade "pip>=25.1"
 	$(BIN)/python -m pip install -q -e .

@@ -72,7 +72,10 @@ def find_contents(file: FileReader) -> Contents:
     magic = file.read(0, 8)
     if magic != MCAP0_MAGIC:
         short = f" ({file.size} bytes)" if file.size < 8 else ""
-        raise MarchaError(f"{path}: not an MCAP recording{short}: it begins with {magic.hex(' ')}")
+        raise MarchaError(
+            f"{path}: not an MCAP recording{short}: it begins with {magic.hex(' ')}; `marcha convert` makes one "
+            "of a raw log"
+        )
     stated: Statistics | None = None
     try:
         contents = _summary(file)
