@@ -60,8 +60,8 @@ class Engine:
         bits.
     speed : "max" or float
         Factor of real time.
-    gap : GapPolicy
-        What happens when the first input of an estimator pauses.
+    gap : GapPolicy or mapping of str to GapPolicy
+        What happens when a regular input of an estimator pauses; by the name of the input where they differ.
     clock : Clock
         Paces the replay.
     start_ns, end_ns : int, optional
@@ -126,14 +126,15 @@ class Engine:
         self._corrections, self._corrected = corrections(list(chosen.values()), source.channels)
 
         raw = any(s.raw for s in self.sinks)
-        read = served
-        self._topics = [t for t in source.channels if raw or t in read]
+        self._topics = [t for t in source.channels if raw or t in served]
         self._raw_topics = set(source.channels) if raw else set()
         estimates = {c.topic: c for r in runs for c in r.outputs.values()}
         self.plan = Plan(source.name, {t: source.channels[t] for t in self._topics} | estimates, tuple(runs))
 
         self._written: dict[str, int] = {}
-        self._seen: dict[str, int] = {}  # most messages a topic ever had: sinks without rewind have those
+        self._most_written: dict[
+            str, int
+        ] = {}  # by topic, before any rewind: sinks without rewind have those
         self._position_ns = self._begin_ns = start_ns if start_ns is not None else source.start_ns
         self._newest_ns = 0
         self._merged: Merged | None = None
@@ -363,12 +364,12 @@ class Engine:
     def _emit(self, topic: str, block: Block, raw: bool = False) -> None:
         before = self._written.get(topic, 0)
         after = self._written[topic] = before + len(block)
-        before_rewind = self._seen.get(topic, 0)
-        self._seen[topic] = max(before_rewind, after)
+        most = self._most_written.get(topic, 0)
+        self._most_written[topic] = max(most, after)
         for sink in self.sinks:
             if raw and not sink.raw:
                 continue
-            fresh = block if sink.rewinds else block.since(max(0, before_rewind - before))
+            fresh = block if sink.rewinds else block.since(max(0, most - before))
             if len(fresh):
                 sink.write_block(topic, fresh)
 
@@ -427,6 +428,7 @@ class Engine:
             "mode": self.mode,
             "gap.policy": gap.policy,
             "gap.max_gap_s": f"{gap.limit_s(plan.rate_hz):g}",
+            **{f"gap.policy.{i}": p.policy for i in plan.topics if (p := policy_of(self.gap, i)) != gap},
             "range.start_ns": "" if self._start_ns is None else str(self._start_ns),
             "range.end_ns": "" if self._end_ns is None else str(self._end_ns),
             "samples": str(runner.samples),
