@@ -142,6 +142,9 @@ def rate_hz(t_ns: Times) -> float:
 
 
 def evenness(t_ns: Times) -> float:
-    """Return the largest departure of an interval from the mean one, as a share of it."""
+    """Return the largest departure of an interval from the mean one, as a share of it.
+
+    Shape of ``t_ns``: (n,).
+    """
     steps = np.diff(t_ns)
     return float(np.abs(steps / steps.mean() - 1).max()) if len(steps) else 0.0

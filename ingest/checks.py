@@ -37,7 +37,10 @@ PLAUSIBLE = {
 def check_plausible(
     report: ReportBuilder, topic: str, columns: Mapping[str, FloatArray], lines: NDArray[np.int64]
 ) -> None:
-    """Report ``unit_doubt`` where the median of a pressure, field or temperature is not of this Earth."""
+    """Report ``unit_doubt`` where the median of a pressure, field or temperature is not of this Earth.
+
+    Shapes: each of ``columns`` and ``lines`` (n,); SI units.
+    """
     values = {name: columns[name] for name in ("pressure_pa", "temperature_c") if name in columns}
     if all(f"mag_{a}" in columns for a in "xyz"):
         values["mag"] = np.sqrt(sum(columns[f"mag_{a}"] ** 2 for a in "xyz"))
@@ -107,7 +110,10 @@ class SensorCheck:
             self._moved[i] = bool(np.any(values[i] != self._first[i]))
 
     def feed_si(self, acc: Sequence[FloatArray], gyr: Sequence[FloatArray], lines: NDArray[np.int64]) -> None:
-        """Look at the same block in m/s² and rad/s (either may be empty) for doubts about units."""
+        """Look at the same block in m/s² and rad/s (either may be empty) for doubts about units.
+
+        Shapes: ``acc`` and ``gyr`` three arrays each, (n,), as ``lines``.
+        """
         if len(acc) == 3 and self._rest is None:
             n = min(len(lines), 20_000) // REST_ROWS * REST_ROWS
             norm = np.sqrt(acc[0][:n] ** 2 + acc[1][:n] ** 2 + acc[2][:n] ** 2).reshape(-1, REST_ROWS)

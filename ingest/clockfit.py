@@ -239,7 +239,10 @@ def turn_rate(t: FloatArray, rot: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def even(t: FloatArray, values: FloatArray, band_hz: float) -> tuple[float, FloatArray]:
-    """Return the first time and values at :data:`RATE_HZ`, low-passed without delay; NaN in gaps and near them."""
+    """Return the first time and values at :data:`RATE_HZ`, low-passed without delay; NaN in gaps and near them.
+
+    Shapes: ``t`` (n,) in s, ``values`` (n, k).
+    """
     from scipy.signal import butter, sosfiltfilt
 
     good = np.isfinite(values).all(axis=1)

@@ -158,7 +158,10 @@ def marker_table(names: Sequence[str], pos: FloatArray) -> pl.DataFrame:
 
 
 def note_hidden(names: Sequence[str], pos: FloatArray, report: ReportBuilder) -> None:
-    """Say how much of the markers was not seen."""
+    """Say how much of the markers was not seen.
+
+    Shape of ``pos``: (n, markers, 3).
+    """
     hidden = np.isnan(pos).any(axis=2)
     if hidden.any():
         row, k = (int(i[0]) for i in np.nonzero(hidden))
@@ -217,7 +220,10 @@ def marker_import(
     options: MarkerOptions,
     more: Sequence[tuple[ChannelSpec, pl.DataFrame]] = (),
 ) -> Import:
-    """Return the import of a capture of markers (m), of channels ``more`` at the same times, and of its angles."""
+    """Return the import of a capture of markers (m), of channels ``more`` at the same times, and of its angles.
+
+    Shapes: ``t_ns`` and ``lines`` (n,), ``pos`` (n, markers, 3).
+    """
     note_hidden(names, pos, report)
     table = marker_table(names, pos)
     spec = ChannelSpec(MARKERS_TOPIC, MARKERS, "optical", tuple(table.columns))
@@ -239,7 +245,10 @@ def angle_channels(
     report: ReportBuilder,
     options: MarkerOptions,
 ) -> list[tuple[ChannelSpec, pl.DataFrame]]:
-    """Return ``/reference/optical/joint`` and ``…/<segment>/orientation`` as far as the markers say them."""
+    """Return ``/reference/optical/joint`` and ``…/<segment>/orientation`` as far as the markers say them.
+
+    Shapes: ``t_ns`` (n,), ``pos`` (n, markers, 3) in m.
+    """
     if options.angles == "off":
         return []
     roles = {}

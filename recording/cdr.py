@@ -148,7 +148,10 @@ class Layout:
         return record
 
     def fits(self, block: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return which messages of ``block`` (a view with this layout's type) have this layout's lengths."""
+        """Return which messages of ``block`` (a view with this layout's type) have this layout's lengths.
+
+        Shapes: ``block`` and result (n,).
+        """
         good = block["#"] == _ENCAPSULATION_WORD[self.order]
         for path, count in self.counts.items():
             good &= block[f"{path}#"] == count
@@ -156,6 +159,8 @@ class Layout:
 
     def leaf(self, block: NDArray[Any], path: str) -> NDArray[Any]:
         """Return the values of one leaf; ``path`` may end in an index, ``position[3]``.
+
+        Shapes: ``block`` (n,), result (n,), or (n, k) of an array of k values.
 
         Raises
         ------
@@ -171,7 +176,10 @@ class Layout:
         return block[base][..., index]
 
     def text(self, block: NDArray[Any], path: str) -> str | None:
-        """Return the string at ``path`` in the first message of ``block``; None where there is none."""
+        """Return the string at ``path`` in the first message of ``block``; None where there is none.
+
+        Shape of ``block``: (n,).
+        """
         if path not in self.counts or path in self.sequences:
             return None
         if self.counts[path] == 0:

@@ -214,7 +214,7 @@ def split(
 
     Parameters
     ----------
-    data : ndarray of uint8
+    data : ndarray of uint8, shape (bytes,)
         Decompressed records.
     wanted : collection of int or None
         Channel ids to return; None for all.

@@ -40,6 +40,8 @@ class Binding(NamedTuple):
 def check_times(values: NDArray[Any], where: str) -> NDArray[np.int64]:
     """Return times as int64, refusing what ``builtin_interfaces/Time`` cannot hold.
 
+    Shapes: ``values`` and result (n,), ns.
+
     Raises
     ------
     MarchaError
@@ -55,7 +57,10 @@ def check_times(values: NDArray[Any], where: str) -> NDArray[np.int64]:
 
 
 def index_of(log: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the index of records of these sizes, one behind the other; see :attr:`Chunk.index`."""
+    """Return the index of records of these sizes, one behind the other; see :attr:`Chunk.index`.
+
+    Shapes: ``log`` (ns) and ``sizes`` (bytes) (n,), result (n, 2).
+    """
     return np.column_stack((log, np.cumsum(sizes) - sizes))
 
 

@@ -142,7 +142,10 @@ class BoundLayout:
         )
 
     def fits(self, block: NDArray[Any]) -> bool:
-        """Return whether all messages have this layout and the same frame id and names."""
+        """Return whether all messages have this layout and the same frame id and names.
+
+        Shape of ``block``: (n,).
+        """
         return bool(self.layout.fits(block).all()) and all((block[p] == v).all() for p, v in self._constants)
 
 

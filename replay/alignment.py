@@ -57,7 +57,10 @@ def yaw_of(quat_wxyz: FloatArray) -> FloatArray:
 
 
 def wrap(angle: FloatArray) -> FloatArray:
-    """Return angles in [−π, π)."""
+    """Return angles in [−π, π).
+
+    Any shape; rad.
+    """
     return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
 
 

@@ -59,7 +59,10 @@ class JointCycles(msgspec.Struct, frozen=True):
 def cycle_starts(
     annotations: pl.DataFrame, joint: str, t_ns: IntArray, reference: FloatArray
 ) -> tuple[IntArray, Literal["events", "signal"]]:
-    """Return where a joint's cycles begin, and by what."""
+    """Return where a joint's cycles begin, and by what.
+
+    Shapes: ``t_ns`` and ``reference`` (rad) (n,), result (cycles,) in ns.
+    """
     events = events_of(annotations, joint)
     if len(events) >= LEAST_EVENTS:
         return events, "events"

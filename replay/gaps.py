@@ -67,7 +67,10 @@ class Tally:
     largest: float = 0.0
 
     def add(self, times_ns: IntArray, values: FloatArray | None = None) -> None:
-        """Count these."""
+        """Count these.
+
+        Shapes: both (n,).
+        """
         if not len(times_ns):
             return
         self.count += len(times_ns)

@@ -82,6 +82,9 @@ class MergedPart:
     keys: dict[str, IntArray]
 
     def add(self, topic: str, table: pl.DataFrame, keys: IntArray) -> None:
-        """Put the results of a run beside the messages that caused them."""
+        """Put the results of a run beside the messages that caused them.
+
+        Shape of ``keys``: (n,), one a row of ``table``; see :class:`Merged`.
+        """
         self.tables[topic] = table
         self.keys[topic] = keys

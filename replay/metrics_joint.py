@@ -45,39 +45,60 @@ _FOREIGN = re.compile(
 
 
 def wrapped_deg(estimate: FloatArray, reference: FloatArray) -> FloatArray:
-    """Return estimate − reference (rad) in degrees within ±180."""
+    """Return estimate − reference (rad) in degrees within ±180.
+
+    Shapes: all (n,).
+    """
     return np.degrees((estimate - reference + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def rmse_deg(error_deg: FloatArray) -> float:
-    """Return the root mean square error."""
+    """Return the root mean square error.
+
+    Shape of ``error_deg``: (n,).
+    """
     return float(np.sqrt(np.mean(np.square(error_deg)))) if error_deg.size else float("nan")
 
 
 def bias_deg(error_deg: FloatArray) -> float:
-    """Return the mean error."""
+    """Return the mean error.
+
+    Shape of ``error_deg``: (n,).
+    """
     return float(np.mean(error_deg)) if error_deg.size else float("nan")
 
 
 def rmse_unbiased_deg(error_deg: FloatArray) -> float:
-    """Return the root mean square error about the mean error."""
+    """Return the root mean square error about the mean error.
+
+    Shape of ``error_deg``: (n,).
+    """
     return float(np.std(error_deg)) if error_deg.size else float("nan")
 
 
 def pearson_r(a: FloatArray, b: FloatArray) -> float:
-    """Return Pearson's correlation; NaN where one does not vary."""
+    """Return Pearson's correlation; NaN where one does not vary.
+
+    Shapes: both (n,).
+    """
     if a.size < 2 or np.ptp(a) == 0.0 or np.ptp(b) == 0.0:
         return float("nan")
     return float(np.corrcoef(a, b)[0, 1])
 
 
 def rom_error_deg(estimate: FloatArray, reference: FloatArray) -> float:
-    """Return the error of the range of motion, largest minus smallest angle (rad in, degrees out)."""
+    """Return the error of the range of motion, largest minus smallest angle (rad in, degrees out).
+
+    Shapes: both (n,).
+    """
     return float(np.degrees(np.ptp(estimate) - np.ptp(reference))) if estimate.size else float("nan")
 
 
 def bland_altman_deg(error_deg: FloatArray) -> tuple[float, float]:
-    """Return the limits of agreement: mean ∓ 1.96 standard deviations (Bland and Altman 1986)."""
+    """Return the limits of agreement: mean ∓ 1.96 standard deviations (Bland and Altman 1986).
+
+    Shape of ``error_deg``: (n,).
+    """
     if error_deg.size < 2:
         return float("nan"), float("nan")
     spread = 1.96 * float(np.std(error_deg, ddof=1))
@@ -88,6 +109,8 @@ def delay_s(
     t_ns: IntArray, estimate: FloatArray, ref_ns: IntArray, reference: FloatArray, most_s: float = 0.3
 ) -> float:
     """Return by how much the estimate lags the reference: where the error without its mean is least.
+
+    Shapes: the estimate's (n,), the reference's (m,); rad.
 
     Whole milliseconds between ± ``most_s``, refined by a parabola. NaN where the reference does not vary.
     """
@@ -116,6 +139,8 @@ def delay_s(
 
 def consistency(error_deg: FloatArray, sigma_deg: FloatArray) -> dict[str, float]:
     """Return the share of errors inside the stated 95 % and the mean squared error over its stated variance.
+
+    Shapes: both (n,).
 
     Errors count with their mean: a mounting that is off, a reference's own error and delay are in them.
     """
@@ -168,6 +193,8 @@ def cycles_of(
 def starts_from_signal(t_ns: IntArray, angle: FloatArray, least_s: float = 0.6) -> IntArray:
     """Return starts of cycles from a joint angle itself: its main maxima, at least ``least_s`` apart.
 
+    Shapes: ``t_ns`` and ``angle`` (rad) (n,), result (cycles,) in ns.
+
     A maximum must reach half of the way from the median to the 99th percentile.
     """
     if len(angle) < 3:
@@ -201,7 +228,10 @@ def events_of(annotations: pl.DataFrame, joint: str) -> IntArray:
 def matched(
     t_ns: IntArray, angle: FloatArray, ref_ns: IntArray, reference: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return reference times with a value of both, estimate and reference there, after settling."""
+    """Return reference times with a value of both, estimate and reference there, after settling.
+
+    Shapes: the estimate's (n,), the reference's (m,), results (k,); rad.
+    """
     good, ok = np.isfinite(angle), np.isfinite(reference)
     t, angle, r, reference = t_ns[good], angle[good], ref_ns[ok], reference[ok]
     if len(t) < 2 or len(r) == 0:
@@ -223,6 +253,8 @@ def figures(
     stated: tuple[IntArray, FloatArray] | None = None,
 ) -> dict[str, float]:
     """Return all figures of one joint, names without the joint's; of stretches of time where they are given.
+
+    Shapes: the estimate's (n,), the reference's (m,), ``spans`` (k, 2) in ns.
 
     Cycles are those of the whole walk that lie in a stretch whole; ``starts_ns`` of cycles count instead of the
     signal's. ``stated`` are the standard deviations that the estimate states (ns, rad).

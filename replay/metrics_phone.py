@@ -54,6 +54,8 @@ def _ends(table: pl.DataFrame) -> IntArray:
 def constant_offset(mine: IntArray, theirs: IntArray, tolerance_ns: int = TOLERANCE_NS) -> int:
     """Return by how much most steps lag the reference's (ns); 0 where there are none.
 
+    Shapes: (n,) and (m,), ns.
+
     The offset, at most half a step, under which most pairs lie within the tolerance: the median of those pairs.
     """
     if not mine.size or not theirs.size:
@@ -75,6 +77,8 @@ def constant_offset(mine: IntArray, theirs: IntArray, tolerance_ns: int = TOLERA
 
 def matched(mine: IntArray, theirs: IntArray, tolerance_ns: int = TOLERANCE_NS) -> tuple[IntArray, IntArray]:
     """Return the indices of pairs of one and one within the tolerance, as many as there can be.
+
+    Shapes: (n,) and (m,) in ns, results (k,).
 
     Both in the order of time: the earliest partner that is left is never a worse choice than a later one.
     """

@@ -242,7 +242,10 @@ class SurveyLine:
 
     @classmethod
     def through(cls, xy: FloatArray) -> SurveyLine | None:
-        """Return the line through places in the order in which they were surveyed; None where there is none."""
+        """Return the line through places in the order in which they were surveyed; None where there is none.
+
+        Shape of ``xy``: (n, 2), m.
+        """
         xy = xy[np.concatenate(([True], np.hypot(*np.diff(xy, axis=0).T) > 0))]
         joined = np.hypot(*np.diff(xy, axis=0).T) <= LINE_GAP_M
         if not joined.any():
@@ -270,6 +273,8 @@ class SurveyLine:
 
 def by_shape(points: FloatArray, line: SurveyLine) -> FloatArray:
     """Return the points moved and turned, without scale, so that they lie on a line as well as they can.
+
+    Shapes: ``points`` and result (n, 2), m.
 
     Nearest places and Horn's transform in turn (iterative closest point, Besl and McKay 1992), from where the
     points are. Points beyond the ends of the line move with the others and have no say.

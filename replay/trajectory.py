@@ -60,7 +60,10 @@ class Trajectory:
         return len(self.t_ns)
 
     def within(self, spans: IntArray) -> Trajectory | None:
-        """Return what lies in stretches of time; None where nothing does."""
+        """Return what lies in stretches of time; None where nothing does.
+
+        Shape of ``spans``: (k, 2), ns, half open.
+        """
         keep = inside(self.t_ns, spans)
         if not keep.any():
             return None

@@ -98,7 +98,10 @@ class Comparison:
     dropped_ns: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
 
     def within(self, spans: IntArray) -> Comparison | None:
-        """Return what lies in stretches of time, under the same alignment; None where nothing does."""
+        """Return what lies in stretches of time, under the same alignment; None where nothing does.
+
+        Shape of ``spans``: (k, 2), ns, half open.
+        """
         keep = inside(self.t_ns, spans)
         if not keep.any():
             return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
 
@@ -122,3 +123,18 @@ def test_changelog_has_what_is_not_released_yet_and_this_version() -> None:
         len(text.split("## [Unreleased]")[1].split("\n## [")[0]) > 200
         or PYPROJECT["project"]["version"] in sections
     )
+
+
+def test_the_architecture_page_names_what_exists() -> None:
+    text = read(DOCS / "architecture.md")
+    packages = {"mr": "recording", "rp": "replay"}
+    named = set(
+        re.findall(r"(?<![\w./`-])(mr|rp|viz|ingest|export|study|recording)\.([A-Za-z_][\w.]*)", text)
+    )
+    assert len(named) > 20
+    for package, path in named:
+        place = f"marcha.{packages.get(package, package)}"
+        thing = importlib.import_module(place)
+        for part in path.rstrip(".").split("."):
+            place += f".{part}"
+            thing = getattr(thing, part, None) or importlib.import_module(place)

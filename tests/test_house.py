@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 import tomllib
@@ -160,3 +161,29 @@ def test_variables_say_what_they_hold(path: Path) -> None:
         name = node.arg if isinstance(node, ast.arg) else node.id if isinstance(node, ast.Name) else ""
         if (path.relative_to(ROOT).as_posix(), name) not in public:
             assert name not in VAGUE, f"{path}:{getattr(node, 'lineno', 0)}: {name}"
+
+
+ARRAY = re.compile(r"NDArray|FloatArray|IntArray|\bFloats\b|\bTimes\b|ndarray")
+SHAPE = re.compile(r"\b[Ss]hapes?\b|\([\wµ…≤ ·+]+,( |\)|[\wµ])|vector|column|row|scalar")
+COMPILED = ("compiled", "inlined", "njit")
+CONTRACTS = {"draw", "flush", "step", "take"}
+"""Methods whose arguments the base class describes."""
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_public_functions_tell_the_shapes_of_their_arrays(path: Path) -> None:
+    """Kernels apart: they take records, whose fields have their shapes in one place."""
+
+    def check(body: list[ast.stmt]) -> None:
+        for node in body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                check(node.body)
+            if not isinstance(node, ast.FunctionDef) or node.name.startswith("_") or node.name in CONTRACTS:
+                continue
+            if any(word in ast.unparse(d) for d in node.decorator_list for word in COMPILED):
+                continue
+            kinds = [ast.unparse(a.annotation) for a in node.args.args + node.args.kwonlyargs if a.annotation]
+            if any(ARRAY.search(kind) for kind in kinds):
+                assert SHAPE.search(ast.get_docstring(node) or ""), f"{path}:{node.lineno}: {node.name}"
+
+    check(ast.parse(path.read_text(encoding="utf-8")).body)

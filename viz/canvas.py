@@ -328,12 +328,18 @@ class Canvas:
             self.columns(path, t_ns, rr.Scalars.columns(scalars=values))
 
     def text(self, path: str, t_ns: Times, text: Sequence[str]) -> None:
-        """Log lines of text."""
+        """Log lines of text.
+
+        Shape of ``t_ns``: (n,), one a text.
+        """
         clean = [printable(t) for t in text]
         self.columns(path, t_ns, rr.TextLog.columns(text=clean, level=["INFO"] * len(clean)))
 
     def states(self, path: str, t_ns: Times, states: Sequence[str]) -> None:
-        """Log changes of state; the empty one is a gap."""
+        """Log changes of state; the empty one is a gap.
+
+        Shape of ``t_ns``: (n,), one a state.
+        """
         self.columns(path, t_ns, rr.StateChange.columns(state=[printable(s) for s in states]))
 
     def limit(self, path: str, limit: Threshold, unit: str = "") -> None:
@@ -367,7 +373,10 @@ class RecentNorm:
         self.values = np.concatenate([self.values, values])[-self.KEPT :]
 
     def at(self, t_ns: Times) -> Floats:
-        """Return the values at other times, NaN outside of what is kept."""
+        """Return the values at other times, NaN outside of what is kept.
+
+        Shapes: ``t_ns`` and result (n,).
+        """
         if not self.t_ns.size:
             return np.full(len(t_ns), np.nan)
         zero = self.t_ns[0]

@@ -129,7 +129,7 @@ class FootEstimator(RowKernel):
         """Write the filter's own constants and initial values into the record of its state."""
 
     def views(self, state: NDArray[np.uint8]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Return a state as a kernel takes it: the array of its one record, and the ring of samples."""
+        """Return a state, shape (bytes,), as a kernel takes it: an array of its one record, and the ring."""
         first = self.RECORD.itemsize
         count = (len(state) - first) // SAMPLE.itemsize
         return kernel_view(state, self.RECORD, 0), kernel_view(state, SAMPLE, first, count)

@@ -144,7 +144,7 @@ class IndoorFused(KernelEstimator):
         height: float,
         stepped: bool,
     ) -> Cloud:
-        """Return the state before the first message."""
+        """Return the state before the first message; ``raster``: corner (2,) and cell (m), cells of shape (nx, ny)."""
         p = self.params
         s = np.zeros(1, SETTINGS)
         if raster is not None:

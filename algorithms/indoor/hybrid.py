@@ -97,7 +97,10 @@ class IndoorHybrid(PlainEstimator):
         return results
 
     def update(self, fix: np.ndarray) -> None:
-        """Take a trilaterated position (eqs 3.30–3.32)."""
+        """Take a trilaterated position (eqs 3.30–3.32).
+
+        Shape of ``fix``: (2,), m.
+        """
         self.fixes += 1
         if np.isnan(self.at).any():
             self.at, self.variance = fix.copy(), self.params.r

@@ -60,7 +60,7 @@ def coverage(where: Sequence[FloatArray]) -> dict[str, float]:
 
     Parameters
     ----------
-    where : sequence of ndarray
+    where : sequence of ndarray, shape (2,) or more
         x, y, … of each place (m).
 
     Returns

@@ -107,6 +107,8 @@ def azimuth_of(w: float, x: float, y: float, z: float) -> float:
 def compass(mag: FloatArray, up: FloatArray) -> float:
     """Return the azimuth of the phone's y axis from the magnetic field and the upward direction, phone's axes.
 
+    Shapes: both (3,), the field in any unit; rad.
+
     East is field × up, north up × east; NaN where the field is vertical.
     """
     east = np.cross(mag, up)

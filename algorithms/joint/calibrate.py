@@ -248,7 +248,10 @@ def _table(stretch: Stretch, segment: str) -> tuple[Any, FloatArray]:
 def unbroken(
     pairs: Sequence[tuple[tuple[Any, FloatArray], tuple[Any, FloatArray]]],
 ) -> list[vectorfit.Span]:
-    """Return the longest stretches of both sensors without a gap, at the upper's times; at least 3 s, at most six."""
+    """Return the longest stretches of both sensors without a gap, at the upper's times; at least 3 s, at most six.
+
+    Of each sensor times (ns), shape (n,), and values, shape (n, k).
+    """
     spans = []
     for upper, lower in pairs:
         t, s = upper[0].astype(np.float64) * 1e-9, lower[0].astype(np.float64) * 1e-9

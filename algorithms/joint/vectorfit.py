@@ -67,7 +67,10 @@ def basis(axis: FloatArray) -> FloatArray:
 
 
 def moved(base: FloatArray, a: float, b: float) -> FloatArray:
-    """Return ``base`` with its axis moved by a, b in its tangent plane."""
+    """Return ``base`` with its axis moved by a, b in its tangent plane.
+
+    Shapes: ``base`` and result (3, 3), the axis in the last column.
+    """
     axis = base @ np.array([a, b, 1.0])
     axis /= np.linalg.norm(axis)
     x = base[:, 0] - axis * (base[:, 0] @ axis)

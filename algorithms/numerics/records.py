@@ -32,12 +32,17 @@ def record_type(*fields: tuple[Any, ...]) -> np.dtype[Any]:
 
 
 def attributes(records: NDArray[Any]) -> Any:
-    """Return the same records with their fields as attributes, for code that is not compiled."""
+    """Return the same records with their fields as attributes, for code that is not compiled.
+
+    Shapes: both (n,).
+    """
     return records.view(np.recarray)
 
 
 def kernel_view(buffer: NDArray[np.uint8], dtype: np.dtype[Any], first: int, count: int = 1) -> NDArray[Any]:
     """Return ``count`` records from byte ``first`` of ``buffer`` on, as a kernel takes them.
+
+    Shapes: ``buffer`` (bytes,), result (count,).
 
     Compiled code finds fields by the type; where numba is switched off, Python needs them as attributes.
     """

@@ -126,7 +126,10 @@ def utm(lat_deg: FloatArray, lon_deg: FloatArray) -> Grid:
 def from_utm(
     zone: int, south: bool, east_m: FloatArray, north_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return latitude and longitude (deg) of UTM coordinates."""
+    """Return latitude and longitude (deg) of UTM coordinates.
+
+    Shapes: both (n,) in m, results (n,).
+    """
     from pyproj import Proj
 
     lon, lat = Proj(proj="utm", zone=zone, south=south, ellps="WGS84")(east_m, north_m, inverse=True)

@@ -66,6 +66,8 @@ def limits(a: FloatArray, half: int, printed: bool = False) -> tuple[FloatArray,
 def thin(t_s: FloatArray, so_far: bool = False) -> NDArray[np.bool_]:
     """Return which extremes stay: later than mean − σ of the intervals after the one before that stayed.
 
+    Shapes: ``t_s`` (s) and result (n,).
+
     Eqs 3.6–3.9. The earlier of a cluster stays. With ``so_far`` the statistics are those of the intervals
     before each extreme, as sample by sample; none is rejected before there are two.
     """

@@ -180,7 +180,10 @@ class GaitModel:
         self._ride_s = ride_s
 
     def motion(self, t: FloatArray, mount: Mount) -> Motion:
-        """Return what a sensor at ``mount`` does at the times ``t`` (s, ascending)."""
+        """Return what a sensor at ``mount`` does at the times ``t`` (s, ascending).
+
+        Shape of ``t``: (n,).
+        """
         still, angles, pivot, arm = self._foot(t, np.asarray(mount.lever_m))
         rot, omega, alpha = _attitude(*angles)
         r, r1, r2 = arm

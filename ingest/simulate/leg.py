@@ -442,6 +442,8 @@ class LegCapture:
 def joint_angle(rot_upper: FloatArray, rot_lower: FloatArray) -> FloatArray:
     """Return the source's joint angle (rad): the lower segment's turn about x against the upper, negated.
 
+    Shapes: both (…, 3, 3), result (…,).
+
     First angle of the sequence x, y, z from the upper to the lower segment; for a hinge about x it is the
     difference of the rolls.
     """
@@ -450,7 +452,10 @@ def joint_angle(rot_upper: FloatArray, rot_lower: FloatArray) -> FloatArray:
 
 
 def euler(rot_ns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return roll and pitch (rad) of a segment, those of an accelerometer at rest, and its heading."""
+    """Return roll and pitch (rad) of a segment, those of an accelerometer at rest, and its heading.
+
+    Shapes: ``rot_ns`` (n, 3, 3), results (n,) in rad.
+    """
     own = PERSON.T @ rot_ns
     roll = np.arctan2(own[..., 2, 1], own[..., 2, 2])
     pitch = np.arctan2(-own[..., 2, 0], np.hypot(own[..., 2, 1], own[..., 2, 2]))

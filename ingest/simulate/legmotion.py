@@ -86,7 +86,10 @@ def _curve(name: str, phase: FloatArray) -> FloatArray:
 
 
 def smooth(x: FloatArray) -> FloatArray:
-    """Return the step 0 → 1 of least jerk for x from 0 to 1 (third derivative bounded at the ends)."""
+    """Return the step 0 → 1 of least jerk for x from 0 to 1 (third derivative bounded at the ends).
+
+    Any shape.
+    """
     x = np.clip(x, 0.0, 1.0)
     return x**3 * (10 + x * (6 * x - 15))
 
@@ -149,7 +152,10 @@ class MotionTask:
         self._count = count
 
     def angles(self, t: FloatArray, side: str) -> SegmentAngles:
-        """Return the angles of one side at the times ``t`` (s)."""
+        """Return the angles of one side at the times ``t`` (s).
+
+        Shape of ``t``: (n,).
+        """
         flexion = self._walking if self.scenario == "walking" else self._lifting
         phase, gain, trunk, thigh, knee, ankle = flexion(t, side)
         sway = gain * self._off * SIDES[side]
@@ -165,7 +171,10 @@ class MotionTask:
         )
 
     def load(self, t: FloatArray, side: str) -> tuple[FloatArray, FloatArray]:
-        """Return which share of the weight a foot carries (0 … 1), and where: 0 heel … 1 toe."""
+        """Return which share of the weight a foot carries (0 … 1), and where: 0 heel … 1 toe.
+
+        Shapes: ``t`` (n,) in s, results (n,).
+        """
         if self.scenario != "walking":
             return np.full(t.shape, 0.5), np.full(t.shape, 0.3)
         phase, _, moving = self._gait(t, side)
@@ -279,7 +288,10 @@ class Chain:
         self._path = self._pelvis(knots)
 
     def pose(self, t: FloatArray) -> dict[str, Pose]:
-        """Return every segment at the times ``t`` (s): ``trunk``, ``left_thigh``, ``left_shank`` …"""
+        """Return every segment at the times ``t`` (s): ``trunk``, ``left_thigh``, ``left_shank`` …
+
+        Shape of ``t``: (n,).
+        """
         pelvis = np.column_stack([axis(t) for axis in self._path])
         out: dict[str, Pose] = {}
         for side in SIDES:
@@ -347,6 +359,8 @@ def derivatives(
     poses_at: Callable[[FloatArray], Mapping[str, Pose]], t: FloatArray
 ) -> dict[str, tuple[FloatArray, FloatArray, FloatArray, FloatArray]]:
     """Return position (m), ``rot``, acceleration (m/s², in n) and body rate (rad/s) of moving frames.
+
+    Shapes: ``t`` (n,) in s, results (n, 3), (n, 3, 3), (n, 3), (n, 3).
 
     Fourth-order central differences of the poses ``at`` gives (Abramowitz & Stegun 1964, table 25.2).
     """

@@ -273,14 +273,20 @@ class Walker:
         return CubicSpline(grid, path - path[200])  # the way 0 is 200 grid points in
 
     def course_at(self, way: FloatArray) -> FloatArray:
-        """Return the course (rad) at a way from the start (m)."""
+        """Return the course (rad) at a way from the start (m).
+
+        Shapes: ``way`` and result (n,).
+        """
         out = np.full_like(way, self.schedule.course_rad)
         for corner, turn in self.schedule.corners:
             out += turn * _smooth((way - corner) / TURN_M + 0.5)
         return out
 
     def course(self, t: FloatArray) -> FloatArray:
-        """Return the course (rad, from x to y, unwrapped) at the times ``t`` (s)."""
+        """Return the course (rad, from x to y, unwrapped) at the times ``t`` (s).
+
+        Shapes: ``t`` and result (n,).
+        """
         return self.course_at(self._way(t))
 
     def ground(self, t: FloatArray) -> FloatArray:
@@ -288,7 +294,10 @@ class Walker:
         return self._path(self._way(t))
 
     def walking(self, t: FloatArray) -> NDArray[np.bool_]:
-        """Whether the person walks."""
+        """Whether the person walks.
+
+        Shapes: ``t`` (s) and result (n,).
+        """
         out = np.zeros(len(t), dtype=bool)
         for a, b in self._bouts:
             out |= (t >= a) & (t <= b)
@@ -306,14 +315,20 @@ class Walker:
         return out
 
     def envelope(self, t: FloatArray) -> FloatArray:
-        """Return how much of the gait's oscillation there is: 0 standing, 1 walking."""
+        """Return how much of the gait's oscillation there is: 0 standing, 1 walking.
+
+        Shapes: ``t`` (s) and result (n,).
+        """
         out = np.zeros_like(t)
         for a, b in self._bouts:
             out += _smooth((t - a) / self._step_s) * _smooth((b + 0.4 * self._step_s - t) / self._step_s)
         return np.minimum(out, 1.0)
 
     def trunk(self, t: FloatArray) -> FloatArray:
-        """Return the trunk's motion about its place, in w (m): forward, left, up."""
+        """Return the trunk's motion about its place, in w (m): forward, left, up.
+
+        Shapes: ``t`` (n,) in s, result (n, 3).
+        """
         if len(self.schedule.contact_s) < 2:
             return np.zeros((len(t), 3))
         turn, grown = 2 * np.pi * self.phase(t), self.envelope(t)
@@ -325,7 +340,10 @@ class Walker:
         return np.column_stack((forward, left, up))
 
     def ringing(self, t: FloatArray, strike: float, other: float) -> FloatArray:
-        """Return the displacement (m) that contacts make, as one number along the ringing's direction."""
+        """Return the displacement (m) that contacts make, as one number along the ringing's direction.
+
+        Shapes: ``t`` (s) and result (n,).
+        """
         contacts = self.schedule.contact_s
         out = np.zeros_like(t)
         if not len(contacts):
@@ -381,7 +399,10 @@ class Handling:
         return out
 
     def shifted(self, t: FloatArray) -> FloatArray:
-        """Return where the phone is beside its usual place, in w (m)."""
+        """Return where the phone is beside its usual place, in w (m).
+
+        Shapes: ``t`` (n,) in s, result (n, 3).
+        """
         return self._sum(t, self.shift)
 
     def turned(self, t: FloatArray) -> FloatArray:
@@ -409,7 +430,10 @@ class Phone:
         self._wander = size * np.sqrt(2 / 5) * rng.uniform(0.5, 1.5, (5, 3))
 
     def attitude(self, t: FloatArray) -> Rotation:
-        """Return ``rot_nb`` at the times ``t`` (s)."""
+        """Return ``rot_nb`` at the times ``t`` (s).
+
+        Shape of ``t``: (n,).
+        """
         swing, course = self._swing(t), Rotation.from_euler("z", self.walker.course(t)[:, None])
         return course * swing * self.mount
 

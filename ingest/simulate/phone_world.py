@@ -43,7 +43,10 @@ def magnetic_disturbance(
     count: int,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Return the field (T, in n) of iron near the way: bumps of 8 m at ``count`` places; zero where none."""
+    """Return the field (T, in n) of iron near the way: bumps of 8 m at ``count`` places; zero where none.
+
+    Shapes: ``ground`` (n, 3) in m, ``t`` (n,) in s, result (n, 3).
+    """
     out = np.zeros((len(t), 3))
     if not strength_t or not len(plan.contact_s):
         return out

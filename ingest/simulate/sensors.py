@@ -202,7 +202,10 @@ class SimulatedImu:
         return share * size
 
     def counts(self, reading: FloatArray) -> np.ndarray:
-        """Return readings as the converter's int16 counts."""
+        """Return readings as the converter's int16 counts.
+
+        Shapes: ``reading`` and result (n, 6).
+        """
         return np.clip(np.round(reading / self._lsb), -32768, 32767).astype(np.int16)
 
 

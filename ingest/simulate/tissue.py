@@ -50,7 +50,7 @@ def tissue(
     ----------
     pose : callable
         Pose of the segment at given times (s).
-    lever_s : ndarray
+    lever_s : ndarray, shape (3,)
         Place of the sensor (m).
     amount : float
         Factor of the motion; 0: rigid.

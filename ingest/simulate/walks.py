@@ -349,11 +349,17 @@ class Simulation:
                 return
 
     def clock_ns(self, t: FloatArray) -> NDArray[np.int64]:
-        """Return the device clock (ns, without roll-over) at the times ``t`` (s)."""
+        """Return the device clock (ns, without roll-over) at the times ``t`` (s).
+
+        Shapes: ``t`` and result (n,).
+        """
         return self.options.start_ms * 1_000_000 + np.round(t * 1e9).astype(np.int64)
 
     def motion(self, t: FloatArray, sensor: int) -> Motion:
-        """Return truth and ideal readings of sensor 1 or 2 at the times ``t`` (s)."""
+        """Return truth and ideal readings of sensor 1 or 2 at the times ``t`` (s).
+
+        Shape of ``t``: (n,).
+        """
         return self.gait.motion(t, self.options.mount(sensor))
 
     def imu(self, sensor: int, errors: ImuErrors | None = None) -> SimulatedImu:

@@ -245,7 +245,10 @@ def _write(
 
 
 def truth_table(t_ns: NDArray[np.int64], motion: Motion) -> pl.DataFrame:
-    """Return the truth of one sensor as the side file has it."""
+    """Return the truth of one sensor as the side file has it.
+
+    Shape of ``t_ns``: (n,), as the motion's times.
+    """
     columns: dict[str, Any] = {"t_ns": t_ns}
     for field, names in TRUTH_COLUMNS:
         columns |= dict(zip(names.split(), getattr(motion, field).T, strict=True))
