@@ -41,6 +41,7 @@ $(VENV)/.stamp: pyproject.toml
 
 $(VENV)/.stamp-dev: $(VENV)/.stamp
 	$(BIN)/python -m pip install -q --group dev
+	-$(BIN)/python -m pip install -q --group readers  # optional: some platforms have no wheels
 	touch $@
 
 clean:
