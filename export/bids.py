@@ -16,7 +16,7 @@ import polars as pl
 
 from ..recording import Recording
 from ..recording.errors import UsageError
-from ..recording.events import bids_events, events_text, sidecar, to_events
+from ..recording.events import SIDECAR, TABLE, bids_events, events_text, sidecar, to_events
 from ..recording.selection import Selection, selected_topics, within
 from ..recording.threads import Prefetch
 from .facts import origin, pretty
@@ -81,8 +81,8 @@ class BidsExporter:
         ]
         if texts:
             losses.append(f"columns of text: {'; '.join(texts)}")
-        if rec.attachments:
-            losses.append(f"{len(rec.attachments)} attachments")
+        if others := [a.name for a in rec.attachments if a.name not in (TABLE, SIDECAR)]:
+            losses.append(f"attachments: {', '.join(others)}")
         return losses
 
     def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:

@@ -21,6 +21,13 @@ from .tables import EVENT, meaning
 EVEN = 0.01
 """Intervals may differ by this share before a channel counts as uneven."""
 
+MOST = 255
+"""Values in one dimension of a parameter: its size is one byte."""
+WORD = 120
+"""Bytes of an event's label or context; all of a parameter take as much as the longest."""
+ROOM = 90_000
+"""Bytes for events: all parameters together have 255 blocks of 512."""
+
 
 class C3dExporter:
     """C3D file with points in millimetres, analog channels in SI units and events."""
@@ -72,6 +79,18 @@ class C3dExporter:
             losses.append(
                 "ends of annotations: an interval becomes two events, LABEL and LABEL end; the rest is in the side file"
             )
+        marks = within(rec.annotations, options)
+        lead = points or analog
+        if lead is not None and marks.height:
+            events = _events(marks, int(lead.t_ns[0]))
+            if len(events) > MOST:
+                losses.append(
+                    f"more than {MOST} events in one parameter: the others are in LABELS2, TIMES2 …"
+                )
+            if left := len(events) - _fitting(events):
+                losses.append(f"{left} events, for which the file has no room: they are in the side file")
+            if any(len(t.encode()) > WORD for c in ("tier", "label") for t in marks[c].unique().to_list()):
+                losses.append(f"labels and tiers longer than {WORD} bytes: cut")
         others = [
             t
             for t, c in rec.channels.items()
@@ -139,18 +158,16 @@ def _encode(
                     if exact
                     else np.interp(sample_ns, analog.t_ns.astype(float), column, left=np.nan, right=np.nan)
                 )
+        if len(values) > MOST:
+            raise UsageError(
+                f"{rec.path}: {len(values)} analog channels, a C3D file holds {MOST}; choose fewer with --topic"
+            )
         if values:  # a channel whose messages were lost has none
             file["data"]["analogs"] = np.stack(values)[None]
             parameters["ANALOG"]["RATE"]["value"] = [rate * ratio]
             parameters["ANALOG"]["LABELS"]["value"] = labels
             parameters["ANALOG"]["UNITS"]["value"] = units
-    events = _events(marks, int(lead.t_ns[0]))
-    if events:
-        times = np.array([[t // 60, t % 60] for t, _, _ in events], float).T
-        file.add_parameter("EVENT", "USED", [len(events)])
-        file.add_parameter("EVENT", "CONTEXTS", [c for _, c, _ in events])
-        file.add_parameter("EVENT", "LABELS", [label for _, _, label in events])
-        file.add_parameter("EVENT", "TIMES", times)
+    _add_events(file, _events(marks, int(lead.t_ns[0])))
     with scratch_folder() as folder:
         file.write(str(folder / "x.c3d"))
         return (folder / "x.c3d").read_bytes()
@@ -160,8 +177,34 @@ def _events(marks: Any, zero_ns: int) -> list[tuple[float, str, str]]:
     """Return time [s], context and label of each event; an interval gives two."""
     out = []
     for tier, start, end, label in marks.select("tier", "start_ns", "end_ns", "label").iter_rows():
-        text = " ".join(label.split()) or "event"
-        out.append(((start - zero_ns) / 1e9, tier, text))
+        text = _word(" ".join(label.split()) or "event")
+        out.append(((start - zero_ns) / 1e9, _word(tier), text))
         if end > start:
-            out.append(((end - zero_ns) / 1e9, tier, f"{text} end"))
+            out.append(((end - zero_ns) / 1e9, _word(tier), f"{text} end"))
     return sorted(out)
+
+
+def _word(text: str) -> str:
+    return text.encode()[:WORD].decode("utf-8", "ignore")
+
+
+def _fitting(events: list[tuple[float, str, str]]) -> int:
+    """Return how many events the parameters have room for: each word takes as much as the longest one."""
+    if not events:
+        return 0
+    size = max(len(c.encode()) for _, c, _ in events) + max(len(t.encode()) for _, _, t in events) + 8
+    return min(len(events), ROOM // size)
+
+
+def _add_events(file: Any, events: list[tuple[float, str, str]]) -> None:
+    """Add the events that fit; each after the first 255 in numbered parameters, as those of many markers."""
+    whole = events[: _fitting(events)]
+    for number, k in enumerate(range(0, len(whole), MOST), 1):
+        part = whole[k : k + MOST]
+        mark = "" if number == 1 else str(number)
+        if number == 1:
+            file.add_parameter("EVENT", "USED", [len(part)])
+        file.add_parameter("EVENT", f"CONTEXTS{mark}", [c for _, c, _ in part])
+        file.add_parameter("EVENT", f"LABELS{mark}", [label for _, _, label in part])
+        times = np.array([[t // 60, t % 60] for t, _, _ in part], float).T
+        file.add_parameter("EVENT", f"TIMES{mark}", times)

@@ -14,6 +14,7 @@ import polars as pl
 from ..recording import Recording
 from ..recording.annotations import COLUMNS
 from ..recording.errors import MarchaError
+from ..recording.events import SIDECAR, TABLE
 from ..recording.selection import Selection, selected_topics, within
 from .facts import origin
 from .files import write_files
@@ -39,8 +40,8 @@ class MatlabExporter:
         losses = [
             "topics and columns as they are: names are made valid in MATLAB; topic, units and columns say so"
         ]
-        if rec.attachments:
-            losses.append(f"{len(rec.attachments)} attachments")
+        if others := [a.name for a in rec.attachments if a.name not in (TABLE, SIDECAR)]:
+            losses.append(f"attachments: {', '.join(others)}")
         return losses
 
     def export(self, rec: Recording, path: Path, options: Any, *, overwrite: bool = False) -> list[Path]:

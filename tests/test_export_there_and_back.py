@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import marcha.recording as mr
 import numpy as np
+import polars as pl
 import pytest
-from marcha.export import export
+from marcha.export import available, export
+from marcha.export.labels import read_labels
 from marcha.ingest import convert
 from marcha.recording import Recording
+from marcha.recording.changes import change
 
 from .contracts.exporter import START_NS, example
 
@@ -78,3 +82,26 @@ def test_fixes_by_gpx(rec: Recording, tmp_path: Path) -> None:
     assert np.array_equal(got["lat_deg"].to_numpy(), expected["lat_deg"].to_numpy())
     assert np.array_equal(got["lon_deg"].to_numpy(), expected["lon_deg"].to_numpy())
     assert np.abs(got["t_ns"].to_numpy() - expected["t_ns"].to_numpy()).max() <= 1000
+
+
+def test_hundreds_of_events_go_through_c3d_and_back(rec: Recording, tmp_path: Path) -> None:
+    """A parameter of C3D has 255 values and words of 255 bytes; ezc3d itself writes more and then cannot read it."""
+    step = (rec.end_ns - rec.start_ns) // 700
+    starts = [rec.start_ns + step * k for k in range(600)]
+    labels = [f"event {k} 歩" for k in range(599)] + ["long " * 100]
+    marks = pl.DataFrame({"tier": "many", "start_ns": starts, "end_ns": starts, "label": labels})
+    change(rec, tmp_path / "many.mcap", add=marks)
+    many = mr.open(tmp_path / "many.mcap")
+    c3d: Any = available()["c3d"]()
+    losses = c3d.losses(many, c3d.Options())
+    assert any("LABELS2" in text for text in losses)
+    assert any("cut" in text for text in losses)
+    export(many, "c3d", tmp_path / "a.c3d")
+    convert([tmp_path / "a.c3d"], tmp_path / "back.mcap")
+    back = mr.open(tmp_path / "back.mcap")
+    read = [read_labels(tmp_path / "a.c3d", back).annotations, back.annotations]
+    for table in read:
+        mine = table.filter(pl.col("tier") == "many").sort("start_ns")["label"].to_list()
+        kept = len(mine)
+        assert kept > 255
+        assert mine == [label.strip()[:119] if len(label) > 120 else label for label in labels[:kept]]

@@ -40,8 +40,16 @@ def read(path: Path, data: bytes) -> list[Label]:
     used = int(np.ravel(events["USED"]["value"])[0]) if "USED" in events else 0
     if not used:
         return []
-    times = np.asarray(events["TIMES"]["value"], float) if "TIMES" in events else np.zeros((0, 0))
-    words = {key: list(events[key]["value"]) if key in events else [] for key in ("LABELS", "CONTEXTS")}
+    further = [str(n) for n in range(2, len(events)) if f"LABELS{n}" in events]  # beyond 255: LABELS2 …
+    if "LABELS" in events and used <= len(events["LABELS"]["value"]):  # else it counts all
+        used += sum(len(events[f"LABELS{n}"]["value"]) for n in further)
+    words = {
+        key: [w for n in ("", *further) if key + n in events for w in events[key + n]["value"]]
+        for key in ("LABELS", "CONTEXTS")
+    }
+    parts = [np.asarray(events[f"TIMES{n}"]["value"], float) for n in ("", *further) if f"TIMES{n}" in events]
+    even = parts and all(t.ndim == 2 and len(t) == 2 for t in parts)
+    times = np.hstack(parts) if even else np.zeros((0, 0))
     if times.ndim != 2 or times.shape[0] != 2 or times.shape[1] < used or len(words["LABELS"]) < used:
         raise MarchaError(
             f"{path}: EVENT: says {used} events, has {times.shape} times and {len(words['LABELS'])} labels"

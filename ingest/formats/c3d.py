@@ -42,8 +42,12 @@ analog, event = c["parameters"].get("ANALOG", {}), c["parameters"].get("EVENT", 
 words = lambda group, key: [str(x) for k in sorted(group) if k.startswith(key) and (k[len(key):] or "1").isdigit()
                             for x in group[k]["value"]]
 signals = np.ascontiguousarray(c["data"]["analogs"][0].T, dtype="<f8")
-times = np.asarray(event.get("TIMES", {}).get("value", np.zeros((2, 0))), float)
+further = [str(n) for n in range(2, len(event)) if f"LABELS{n}" in event]  # beyond 255: LABELS2 …
+times = [np.asarray(event[f"TIMES{n}"]["value"], float) for n in ("", *further) if f"TIMES{n}" in event]
+times = np.hstack(times) if times and all(t.ndim == 2 and len(t) == 2 for t in times) else np.zeros((2, 0))
 used = int(np.ravel(event.get("USED", {}).get("value", [0]))[0]) if "USED" in event else 0
+if "LABELS" in event and used <= len(event["LABELS"]["value"]):  # else it counts all
+    used += sum(len(event[f"LABELS{n}"]["value"]) for n in further)
 head = {"analog": words(analog, "LABELS"), "analog_units": words(analog, "UNITS"), "analog_shape": signals.shape,
         "analog_rate_hz": float(c["header"]["analogs"]["frame_rate"]),
         "events": used, "event_labels": words(event, "LABELS"), "event_contexts": words(event, "CONTEXTS"),
