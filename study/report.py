@@ -21,27 +21,23 @@ from .published import extremes
 from .report_tests import folded, probability, reasons
 
 
-class ReportContents(msgspec.Struct, frozen=True):
-    """Everything that the report is made of.
+class StudyTables(msgspec.Struct, frozen=True, kw_only=True):
+    """The tables of a study, and what a reader must know.
 
     Attributes
     ----------
     config : StudyConfig
-        The study.
+        The resolved configuration.
     results, values, groups, comparisons, outliers, published, consistency : polars.DataFrame
-        Tables of :mod:`~marcha.study.analysis`.
+        See :mod:`marcha.study.analysis`; ``results`` has one row a cell.
     labels, label_comparisons : polars.DataFrame
-        Tables of :mod:`~marcha.study.labels`.
+        See :mod:`marcha.study.labels`; empty where the study does not say ``by``.
     paired, pairs, verdicts, relations : polars.DataFrame
-        Tables of :mod:`~marcha.study.pairs`.
+        See :mod:`marcha.study.pairs`.
     failures : polars.DataFrame
-        Cells whose results must not be used, by method.
+        Cells whose results must not be used, by method: :func:`marcha.study.analysis.failures`.
     notes : list of str
         What a reader must know before the numbers.
-    provenance : dict
-        Versions, times, machine.
-    toml : str
-        The resolved configuration.
     """
 
     config: cfg.StudyConfig
@@ -60,6 +56,19 @@ class ReportContents(msgspec.Struct, frozen=True):
     relations: pl.DataFrame
     failures: pl.DataFrame
     notes: list[str]
+
+
+class ReportContents(StudyTables, frozen=True, kw_only=True):
+    """Everything that the report is made of.
+
+    Attributes
+    ----------
+    provenance : dict
+        Versions, times, machine.
+    toml : str
+        The resolved configuration as its file.
+    """
+
     provenance: dict[str, Any]
     toml: str
 

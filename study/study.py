@@ -30,78 +30,32 @@ from .cells import (
 )
 from .executors import Executor
 from .gallery import draw
-from .report import ReportContents, render
+from .report import ReportContents, StudyTables, render
 from .store import CellStore, tidy, write_atomic
 
-TABLES = (
-    "results",
-    "values",
-    "groups",
-    "comparisons",
-    "outliers",
-    "published",
-    "consistency",
-    "labels",
-    "label_comparisons",
-    "paired",
-    "pairs",
-    "verdicts",
-    "relations",
-    "failures",
-)
 LIBRARIES = ("marcha", "numpy", "scipy", "numba", "polars", "matplotlib")
 
 
-class StudyResult(msgspec.Struct, frozen=True):
+class StudyResult(StudyTables, frozen=True, kw_only=True):
     """What a study gave; the same tables are in its folder.
 
     Attributes
     ----------
     folder : Path
         The study's folder.
-    config : StudyConfig
-        The resolved configuration.
-    results : polars.DataFrame
-        One row a cell.
-    values, groups, comparisons, outliers, published, consistency : polars.DataFrame
-        See :mod:`marcha.study.analysis`.
-    labels, label_comparisons : polars.DataFrame
-        See :mod:`marcha.study.labels`; empty where the study does not say ``by``.
-    paired, pairs, verdicts, relations : polars.DataFrame
-        See :mod:`marcha.study.pairs`.
-    failures : polars.DataFrame
-        See :func:`marcha.study.analysis.failures`.
     cells_run, cells_reused, cells_failed : int
         Cells computed now; found finished; that ended in an error.
     elapsed_s : float
         Wall time.
-    notes : list of str
-        What a reader must know.
     files : list of Path
         Everything written.
     """
 
     folder: Path
-    config: cfg.StudyConfig
-    results: pl.DataFrame
-    values: pl.DataFrame
-    groups: pl.DataFrame
-    comparisons: pl.DataFrame
-    outliers: pl.DataFrame
-    published: pl.DataFrame
-    consistency: pl.DataFrame
-    labels: pl.DataFrame
-    label_comparisons: pl.DataFrame
-    paired: pl.DataFrame
-    pairs: pl.DataFrame
-    verdicts: pl.DataFrame
-    relations: pl.DataFrame
-    failures: pl.DataFrame
     cells_run: int
     cells_reused: int
     cells_failed: int
     elapsed_s: float
-    notes: list[str]
     files: list[Path]
 
     @property
@@ -286,14 +240,12 @@ def run_study(
         files = _write(folder, contents, pictures)
         write_atomic(folder / RENDERED, lambda path: path.write_text(mark, encoding="utf-8"))
     return StudyResult(
+        **{name: getattr(contents, name) for name in StudyTables.__struct_fields__},
         folder=folder,
-        config=config,
-        **{name: getattr(contents, name) for name in TABLES},
         cells_run=sum(c.key not in reused for c in cells),
         cells_reused=sum(c.key in reused for c in cells),
         cells_failed=sum(c.status != "ok" for c in cells),
         elapsed_s=time.perf_counter() - begin,
-        notes=contents.notes,
         files=files,
     )
 

@@ -43,4 +43,6 @@ def written_together(folder: Path, paths: Sequence[Path], *, overwrite: bool) ->
                     shutil.rmtree(path)
                 (Path(made) / path.name).replace(path)
     except OSError as error:
-        raise MarchaError(f"{error.filename or folder}: cannot write: {error.strerror or error}") from error
+        raise MarchaError(
+            f"{error.filename or folder}: cannot write: {error.strerror or error}; nothing was written"
+        ) from error

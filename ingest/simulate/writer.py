@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any, Literal
 
@@ -13,13 +12,14 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from ...recording.errors import MarchaError, OutputExists, UsageError
+from ...recording.errors import UsageError
 from .floor import FLOOR_SCENARIOS
 from .gait import Motion
 from .leg import SCENARIOS as LEGS
 from .leg import leg
 from .legfiles import files
 from .phone_routes import PHONE_SCENARIOS
+from .together import written_together
 from .walks import Simulation, checked, make_options
 
 CHATTER = (
@@ -176,15 +176,10 @@ def simulate(
     folder = Path(out_dir)
     log = folder / (stem + (".csv" if format == "text" else ".bin"))
     truths = [folder / f"{stem}.truth{part}" for part in (".csv", ".imu2.csv", ".toml")]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with _outputs([log, *truths], overwrite) as (raw, truth1, truth2, facts):
-            rows = _write(simulation, line, format, raw, (truth1, truth2))
-            facts.write(msgspec.toml.encode(_facts(simulation, line, format)))
-    except OSError as error:
-        raise MarchaError(
-            f"{error.filename or folder}: cannot write: {error.strerror or error}; nothing was written"
-        ) from error
+    with written_together(folder, (log, *truths), overwrite=overwrite) as part, ExitStack() as stack:
+        raw, truth1, truth2, facts = (stack.enter_context((part / p.name).open("wb")) for p in (log, *truths))
+        rows = _write(simulation, line, format, raw, (truth1, truth2))
+        facts.write(msgspec.toml.encode(_facts(simulation, line, format)))
     return Simulated([log], truths, rows, simulation.route.closed, simulation.length_m)
 
 
@@ -202,15 +197,9 @@ def _leg(
         raise UsageError(f"simulate {scenario}: captures of legs are text; leave out format={format}")
     capture = leg(scenario, seed=seed, **options)
     raw, truth = files(capture, folder, name or f"{scenario}-{seed:03d}")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with _outputs([*raw, *truth], overwrite) as handles:
-            for handle, content in zip(handles, (*raw.values(), *truth.values()), strict=True):
-                handle.write(content)
-    except OSError as error:
-        raise MarchaError(
-            f"{error.filename or folder}: cannot write: {error.strerror or error}; nothing was written"
-        ) from error
+    with written_together(folder, (*raw, *truth), overwrite=overwrite) as part:
+        for path, content in (*raw.items(), *truth.items()):
+            (part / path.name).write_bytes(content)
     logs = [p for p in raw if p.suffix != ".toml"]  # the mapping is found beside the CSV
     return Simulated(logs, [*truth, *(p for p in raw if p.suffix == ".toml")], len(capture.t), False, 0.0)
 
@@ -340,24 +329,3 @@ def _facts(simulation: Simulation, line: Line, format: str) -> dict[str, Any]:
         "line": msgspec.to_builtins(line),
         **sensors,
     }
-
-
-@contextmanager
-def _outputs(paths: list[Path], overwrite: bool) -> Iterator[Sequence[IO[bytes]]]:
-    """Open files under temporary names; all get their names when the block ends well, none otherwise."""
-    for path in paths:
-        if path.exists() and not overwrite:
-            raise OutputExists(path)
-    temporary = [p.with_name(f".{p.name}.{os.getpid()}.part") for p in paths]
-    try:
-        with ExitStack() as stack:
-            files = [stack.enter_context(p.open("wb")) for p in temporary]
-            yield files
-            for file in files:
-                file.flush()
-                os.fsync(file.fileno())
-        for part, path in zip(temporary, paths, strict=True):
-            part.replace(path)
-    finally:
-        for part in temporary:
-            part.unlink(missing_ok=True)
