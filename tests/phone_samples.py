@@ -207,6 +207,107 @@ def getsensordata(path: Path, walk: PhoneWalk) -> Path:
     return path
 
 
+GETSENSORDATA_HEAD = """% LogFile created by the 'GetSensorData' App for Android.
+% Date of creation: Mon Mar 09 08:51:47 GMT-03:00 2026
+% Developed by LOPSI research group at CAR-CSIC, Spain (http://www.car.upm-csic.es/lopsi)
+% Version 2.1 January 2018
+%
+% Phone used for this logfile:
+% Manufacturer:            \tsamsung
+%
+% LogFile Data format:
+% Accelerometer data: \t'ACCE;AppTimestamp(s);SensorTimestamp(s);Acc_X(m/s^2);Acc_Y(m/s^2);Acc_Z(m/s^2);Accuracy(integer)'
+% Gyroscope data:     \t'GYRO;AppTimestamp(s);SensorTimestamp(s);Gyr_X(rad/s);Gyr_Y(rad/s);Gyr_Z(rad/s);Accuracy(integer)'
+% Magnetometer data:  \t'MAGN;AppTimestamp(s);SensorTimestamp(s);Mag_X(uT);;Mag_Y(uT);Mag_Z(uT);Accuracy(integer)'
+% Pressure data:      \t'PRES;AppTimestamp(s);SensorTimestamp(s);Pres(mbar);Accuracy(integer)'
+% Orientation data:   \t'AHRS;AppTimestamp(s);SensorTimestamp(s);PitchX(deg);RollY(deg);YawZ(deg);Quat(2);Quat(3);Quat(4);Accuracy(int)'
+% GNSS/GPS data:      \t'GNSS;AppTimestamp(s);SensorTimeStamp(s);Latit(deg);Long(deg);Altitude(m);Bearing(deg);Accuracy(m);Speed(m/s);SatInView;SatInUse'
+% WIFI data:          \t'WIFI;AppTimestamp(s);SensorTimeStamp(s);Name_SSID;MAC_BSSID;Frequency;RSS(dBm);'
+% Bluetooth data:     \t'BLUE;AppTimestamp(s);Name;MAC_Address;RSS(dBm);'
+% BLE 4.0 data:       \t'BLE4;AppTimestamp(s);iBeacon;MAC;RSSI(dBm);Power;MajorID;MinorID;UUID'
+% BLE 4.0 data:       \t'BLE4;AppTimestamp(s);Eddystone;MAC;RSSI(dBm);instanceID;OptionalTelemetry[voltaje;temperature]'
+% Sound data:         \t'SOUN;AppTimestamp(s);RMS;Pressure(Pa);SPL(dB);'
+% POSI Reference:    \t\t'POSI;Timestamp(s);Counter;Latitude(degrees); Longitude(degrees);floor ID(0,1,2..4);Building ID(0,1,2..3);'
+%
+"""  # noqa: E501
+"""The head of version 2.1, as the app writes it (the doubled semicolon is its own)."""
+
+
+def getsensordata_21(path: Path, walk: PhoneWalk) -> Path:
+    """Write what version 2.1 writes: declared columns, other columns of signals, satellites, sound, no accuracy."""
+    rows = [GETSENSORDATA_HEAD]
+    quat = np.where(walk.quat_wxyz[:, :1] < 0, -walk.quat_wxyz, walk.quat_wxyz)
+    for k, s in enumerate(seconds(walk)):
+        both = f"{s:.3f};{s + 1527.1:.4f}"
+        rows.append(f"ACCE;{both};" + ";".join(f"{v:.5f}" for v in walk.acc_b[k]) + ";3")
+        rows.append(f"MAGN;{both};" + ";".join(f"{v:.5f}" for v in walk.mag_b[k] * 1e6) + ";3")
+        rows.append(f"AHRS;{both};1.0;2.0;3.0;" + ";".join(f"{v:.8f}" for v in quat[k, 1:]) + ";3")
+        if k % 100 == 10:
+            rows.append(f"WIFI;{s:.3f};{s + 1527:.3f};eduroam;16:74:9c:2b:4d:1b;2412;-41")
+            rows.append(
+                f"BLE4;{s:.3f};iBeacon;e0:78:a3:3d:b5:ab;-77;-59;1;2;b9407f30-f5f8-466e-aff9-25556b57fe6d"
+            )
+            rows.append(f"BLE4;{s:.3f};Eddystone;e0:78:a3:3d:b5:ac;-80;0102")
+            rows.append(f"BLUE;{s:.3f};watch;e0:78:a3:3d:b5:ad;-60")
+            rows.append(f"SOUN;{s:.3f};210.1;0.02;61.2")
+    for f in walk.fixes.iter_rows(named=True):
+        s = (f["t_ns"] - walk.t_ns[0]) / 1e9
+        place = f"{f['lat_deg']:.8f};{f['lon_deg']:.8f};{f['alt_m']:.3f}"
+        rows.append(f"GNSS;{s:.3f};{f['t_ns'] / 1e9:.3f};{place};0.0;4.5;1.2;20;9")
+    o = walk.options
+    rows.append(f"POSI;{seconds(walk)[-1]:.3f};1;{o.lat_deg};{o.lon_deg};0;0")
+    path.write_text("\n".join([*rows, ""]))
+    return path
+
+
+def gnsslogger_v3(path: Path, walk: PhoneWalk) -> Path:
+    """Write GnssLogger 3's text: satellites' rows between, three providers, rates with drift, orientation.
+
+    UTC is cut to whole milliseconds, beside the nanoseconds since boot.
+    """
+    rows = [
+        "# ",
+        "# Header Description:",
+        "# ",
+        "# Version: v3.0.6.4 Platform: 13 Manufacturer: Google Model: Pixel 6",
+    ]
+    rows += ["# ", "# Raw,utcTimeMillis,TimeNanos,LeapSecond,TimeUncertaintyNanos,Svid", "# "]
+    for kind, unit, bias in (
+        ("Accel", "Mps2", "Bias"),
+        ("Gyro", "RadPerSec", "Drift"),
+        ("Mag", "MicroT", "Bias"),
+    ):
+        axes = ",".join(f"Uncal{kind}{a}{unit}" for a in "XYZ")
+        more = ",".join(f"{bias}{a}{unit}" for a in "XYZ")
+        rows.append(f"# Uncal{kind},utcTimeMillis,elapsedRealtimeNanos,{axes},{more}")
+        rows.append(
+            f"# {kind},utcTimeMillis,elapsedRealtimeNanos," + ",".join(f"{kind}{a}{unit}" for a in "XYZ")
+        )
+    rows += ["# OrientationDeg,utcTimeMillis,elapsedRealtimeNanos,yawDeg,rollDeg,pitchDeg", "# "]
+    rows.append(
+        "# Fix,Provider,LatitudeDegrees,LongitudeDegrees,AltitudeMeters,SpeedMps,AccuracyMeters,BearingDegrees,"
+        "UnixTimeMillis,SpeedAccuracyMps,BearingAccuracyDegrees,elapsedRealtimeNanos,VerticalAccuracyMeters,MockLocation"
+    )
+    boot = int(walk.t_ns[0]) - 65_972_055_195_160
+    for f in walk.fixes.iter_rows(named=True):
+        for provider, off in (("GPS", 0.0), ("FLP", 2e-5), ("NLP", 3e-3)):
+            rows.append(
+                f"Fix,{provider},{f['lat_deg'] + off:.10f},{f['lon_deg']:.10f},{f['alt_m']:.9f},0.9,4.5,108.3,"
+                f"{f['t_ns'] // 1_000_000},,,{f['t_ns'] - boot},11.185,0"
+            )
+    rows += ["Status,1663712658000,18,0,1,1,,12.80,285.0,16.0,1,1,0,", "Nav,3,769,1,-1,14,116,5,-126,11"]
+    for k, t in enumerate(walk.t_ns.tolist()):
+        at = f"{t // 1_000_000},{t - boot}"
+        gyr, mag = walk.gyr_b[k] + 0.25, walk.mag_b[k] * 1e6 + 200
+        rows.append(f"UncalAccel,{at}," + ",".join(f"{v:.9g}" for v in walk.acc_b[k]) + ",0.0,0.0,0.0")
+        rows.append(f"UncalGyro,{at}," + ",".join(f"{v:.9g}" for v in gyr) + ",0.25,0.25,0.25")
+        rows.append(f"UncalMag,{at}," + ",".join(f"{v:.9g}" for v in mag) + ",200,200,200")
+        rows.append(f"OrientationDeg,{at},201.0,-5.0,-52.0")
+        rows.append(f"Raw,{t // 1_000_000},32083712000000,18,,7")
+    path.write_text("\n".join([*rows, ""]))
+    return path
+
+
 def gnsslogger(path: Path, walk: PhoneWalk) -> Path:
     """Write GnssLogger's text: uncalibrated readings with their bias."""
     rows = [

@@ -23,6 +23,7 @@ from marcha.ingest.formats.sensor_logger import SensorLogger
 from marcha.ingest.formats.tracks import Gpx, Kml
 from marcha.ingest.simulate import PhoneWalk
 from marcha.recording import MarchaError
+from scipy.spatial.transform import Rotation
 
 from . import phone_samples as samples
 from .test_import_phone import ACC, GYR, MAG, PhoneContract, kinds, read, same
@@ -195,6 +196,79 @@ def test_gnsslogger_takes_the_bias_off(tmp_path: Path, walk: PhoneWalk) -> None:
     assert same(tables["/phone/acc"], ACC, walk.acc_b, 1e-5)
     assert np.allclose(tables["/phone/mag"].select(MAG).to_numpy(), walk.mag_b, atol=1e-10)
     assert tables["/phone/gnss"].height == walk.fixes.height
+
+
+def test_getsensordata_reads_the_columns_that_its_head_declares(tmp_path: Path, walk: PhoneWalk) -> None:
+    """Version 2.1: beacons without a sensor's time, Wi-Fi with a frequency, satellites by their own clock."""
+    path = samples.getsensordata_21(tmp_path / "logfile_2026_03_09.txt", walk)
+    assert [c.name for c in recognise(path)] == ["getsensordata"]
+    _, tables, report = read(GetSensorData(), path)
+    assert report.rows_dropped == 0
+    assert np.abs(tables["/phone/acc"].select(ACC).to_numpy() - walk.acc_b).max() < 1e-5
+    assert np.abs(tables["/phone/mag"].select(MAG).to_numpy() - walk.mag_b).max() < 1e-10
+    turn = tables["/phone/orientation"].select("quat_w", "quat_x", "quat_y", "quat_z").to_numpy()
+    assert np.abs(np.abs((turn * walk.quat_wxyz).sum(axis=1)) - 1).max() < 1e-6
+    radio = tables["/phone/radio"].unique("mac", maintain_order=True)
+    assert dict(zip(radio["mac"], radio["rssi_dbm"], strict=True)) == {
+        "16:74:9c:2b:4d:1b": -41,
+        "e0:78:a3:3d:b5:ab": -77,
+        "e0:78:a3:3d:b5:ac": -80,
+        "e0:78:a3:3d:b5:ad": -60,
+    }
+    assert radio.filter(technology="wifi")["frequency_hz"].to_list() == [2.412e9]
+    fixes = tables["/phone/gnss"]
+    assert np.abs(fixes["t_ns"].to_numpy() - (walk.fixes["t_ns"].to_numpy() - walk.t_ns[0])).max() < 2_000_000
+    assert same(fixes, ["lat_deg"], walk.fixes.select("lat_deg").to_numpy(), 1e-7)
+
+
+def test_gnsslogger_takes_one_provider_and_the_exact_clock(tmp_path: Path, walk: PhoneWalk) -> None:
+    path = samples.gnsslogger_v3(tmp_path / "gnss_log_2026_03_09.txt", walk)
+    assert [c.name for c in recognise(path)] == ["gnsslogger"]
+    _, tables, report = read(GnssLogger(), path)
+    assert kinds(report)["other_provider"] == 2 * walk.fixes.height
+    assert same(tables["/phone/gnss"], ["lat_deg"], walk.fixes.select("lat_deg").to_numpy(), 1e-9)
+    assert same(tables["/phone/gyr"], GYR, walk.gyr_b, 1e-6)
+    assert np.abs(tables["/phone/mag"].select(MAG).to_numpy() - walk.mag_b).max() < 1e-9
+    t = tables["/phone/acc"]["t_ns"].to_numpy()
+    assert np.array_equal(np.diff(t), np.diff(walk.t_ns))  # UTC alone is cut to milliseconds
+    assert np.abs(t - walk.t_ns).max() < 1_000_000
+    w, x, y, z = tables["/phone/orientation"].select("quat_w", "quat_x", "quat_y", "quat_z").row(0)
+    top = 2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)  # where the phone's y axis points
+    assert np.degrees(np.arcsin(top[2])) == pytest.approx(52.0)
+    assert np.degrees(np.arctan2(top[0], top[1])) % 360 == pytest.approx(201.0)
+
+
+@pytest.mark.parametrize(("platform", "inverse"), [("android", False), ("ios", False), ("ios", True)])
+def test_sensor_logger_keeps_the_phones_own_orientation(
+    tmp_path: Path, walk: PhoneWalk, platform: str, inverse: bool
+) -> None:
+    """On iOS x is north, and which way a quaternion turns is found from gravity and field; text columns are no loss."""
+    folder = samples.sensor_logger(tmp_path / "log", walk, platform)
+    turn = Rotation.from_quat(np.roll(walk.quat_wxyz, -1, axis=1))
+    if platform == "ios":
+        turn = Rotation.from_euler("z", -90, degrees=True) * turn
+    given = (turn.inv() if inverse else turn).as_quat()
+    rows = (
+        f"{t},{s:.6f},2026-03-09 08:51:47,"
+        + ",".join(f"{v:.9f}" for v in (q[2], q[1], q[0], q[3]))
+        + ",0,0,0"
+        for t, s, q in zip(walk.t_ns, samples.seconds(walk), given, strict=True)
+    )
+    head = "time,seconds_elapsed,date,qz,qy,qx,qw,roll,pitch,yaw"
+    (folder / "Orientation.csv").write_text("\n".join([head, *rows, ""]))
+    _, tables, report = read(SensorLogger(), folder)
+    found = tables["/phone/orientation"].select("quat_w", "quat_x", "quat_y", "quat_z").to_numpy()
+    assert np.abs(np.abs((found * walk.quat_wxyz).sum(axis=1)) - 1).max() < 1e-6
+    assert "missing_cell" not in kinds(report)
+
+
+def test_sensor_logger_leaves_out_an_orientation_that_gravity_denies(tmp_path: Path, walk: PhoneWalk) -> None:
+    folder = samples.sensor_logger(tmp_path / "log", walk)
+    rows = (f"{t},{s:.6f},0,0.8,0,0.6" for t, s in zip(walk.t_ns, samples.seconds(walk), strict=True))
+    (folder / "Orientation.csv").write_text("\n".join(["time,seconds_elapsed,qz,qy,qx,qw", *rows, ""]))
+    _, tables, report = read(SensorLogger(), folder)
+    assert "/phone/orientation" not in tables
+    assert kinds(report)["odd_orientation"] == len(walk.t_ns)
 
 
 def test_a_line_without_times_is_no_recording(tmp_path: Path) -> None:

@@ -6,7 +6,8 @@ force low-passed in an almost inertial frame, heading from the magnetic field in
 at rest and in motion by a Kalman filter. Frames: ``rot_nb``, x east, y (magnetic) north, z up.
 
 Departures: sensors have times of their own (the interval of a gyroscope sample is measured, not nominal);
-the field's disturbance is judged against a reference norm and dip that are learned slowly, or given. Rest is
+the field's disturbance is judged against a reference norm and dip that are learned slowly, or given. Without a
+gyroscope the low-passed force and the field are the attitude (:func:`without_gyroscope`). Rest is
 judged four times as strictly, because somebody who stands and holds a phone is not at rest.
 """
 
@@ -51,6 +52,7 @@ FIELDS: list[tuple[Any, ...]] = [
     ("mag_n", "i8"),
     ("tau_mag", "f8"),
     ("mag_gain", "f8"),
+    ("mag_alone", "i8"),  # without a gyroscope the field is the heading, disturbed or not
     ("ref_norm", "f8"),
     ("ref_dip", "f8"),
     ("ref_fixed", "i8"),
@@ -63,6 +65,8 @@ FIELDS: list[tuple[Any, ...]] = [
     ("dis_norm", "f8"),
     ("dis_dip", "f8"),
 ]
+ALONE_ACC_S, ALONE_MAG_S = 1.5, 0.5
+"""Time constants without a gyroscope (s): above a step's time for the force, below a turn's for the field."""
 REST_MIN_S = 1.5
 REST_TAU_S = 0.5
 
@@ -92,7 +96,14 @@ def configure(
     s["bias_clip"] = math.radians(2.0)
     s["rest_gyr_max"], s["rest_acc_max"] = math.radians(rest_deg_s), 0.5 * rest_deg_s / 2.0
     s["mag_gain"] = 1.0
+    s["mag_alone"] = 0
     s["dis_norm"], s["dis_dip"] = 0.15, math.radians(12.0)
+
+
+def without_gyroscope(s: Any, acc_hz: float) -> None:
+    """Configure record ``s`` so that inclination and heading follow force and field alone."""
+    configure(s, acc_hz, tau_acc=ALONE_ACC_S, tau_mag=ALONE_MAG_S)
+    s["mag_alone"] = 1
 
 
 @compiled
@@ -311,6 +322,6 @@ def take_mag(s: Any, t_ns: int, x: float, y: float, z: float) -> None:
     if s.mag_gain > gain:
         gain = s.mag_gain
         s.mag_gain = s.mag_gain / (s.mag_gain + 1.0)
-    elif s.disturbed == 1:
+    elif s.disturbed == 1 and s.mag_alone == 0:
         gain = 0.0
     s.delta = wrap(s.delta + gain * wrap(s.mag_yaw - s.delta))

@@ -69,6 +69,28 @@ def weigh(s: Any, center: float, sigma: float, share: float) -> None:
 
 
 @compiled
+def branch(s: Any, turn: float, share: float) -> None:
+    """Let every hypothesis be wrong by ``turn`` (rad) with probability ``share``, as far as there is room.
+
+    A ring of hypotheses has that turn in it already: then the weights are shared out.
+    """
+    if s.hyp == HYPOTHESES:
+        half = HYPOTHESES // 2
+        if abs(abs(turn) - math.pi) < 1e-6:
+            for h in range(half):
+                a, b = s.hw[h], s.hw[h + half]
+                s.hw[h], s.hw[h + half] = (1.0 - share) * a + share * b, (1.0 - share) * b + share * a
+        return
+    for h in range(s.hyp):
+        if s.hyp < HYPOTHESES:
+            new = s.hyp
+            _copy(s, h, new)
+            s.hx[new, 2] = wrap(s.hx[new, 2] + turn)
+            s.hw[new], s.hw[h] = share * s.hw[h], (1.0 - share) * s.hw[h]
+            s.hyp = new + 1
+
+
+@compiled
 def step(s: Any, t_ns: int, length: float, heading: float, share: float) -> None:
     """Move all hypotheses by ``share`` of a step (length in m, heading in rad)."""
     age(s, t_ns)

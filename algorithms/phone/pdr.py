@@ -10,6 +10,7 @@ import numpy as np
 
 from ..contract import (
     ALL_COLUMNS,
+    AlgorithmError,
     Context,
     Input,
     KernelEstimator,
@@ -28,11 +29,14 @@ if TYPE_CHECKING:
 
     from ..contract import FloatArray
 
-GYR = Input("gyr", "sensor_msgs/msg/Imu", ("gyr_x", "gyr_y", "gyr_z"), regular=True)
+GYR = Input("gyr", "sensor_msgs/msg/Imu", ("gyr_x", "gyr_y", "gyr_z"), optional=True, regular=True)
 MAG = Input("mag", "sensor_msgs/msg/MagneticField", ("mag_x", "mag_y", "mag_z"), optional=True, regular=True)
 PRESSURE = Input("pressure", "sensor_msgs/msg/FluidPressure", ("pressure_pa",), optional=True)
 GNSS = Input("gnss", "sensor_msgs/msg/NavSatFix", ALL_COLUMNS)
 ROLES = {"gyr": track.GYR, "acc": track.ACC, "mag": track.MAG, "pressure": track.PRESSURE, "gnss": track.GNSS}
+
+FIELD_ALONE = 3.0
+"""Factor of a heading's deviations where no gyroscope smooths the field: sway, iron and tilt are in it."""
 
 POSE = Output(
     "pose",
@@ -47,7 +51,15 @@ SIGMA = Output(
 HEADING = Output(
     "heading",
     "marcha_msgs/msg/NamedValues",
-    ("device_rad", "walking_rad", "magnetic_rad", "disturbed", "offset_rad"),
+    (
+        "device_rad",
+        "walking_rad",
+        "magnetic_rad",
+        "disturbed",
+        "offset_rad",  # of the shaking's fore end from the device's heading
+        "offset_used",
+        "opposite_p",
+    ),
     event=True,
 )
 FIX = Output(
@@ -62,6 +74,10 @@ STATE = Output(
     ("heading_correction_rad", "length_scale", "hypotheses", "correlation_en", "fixes", "outliers"),
     event=True,
 )
+
+
+DOUBTFUL = 0.03
+"""Mean probability of walking the opposite way from which on a run says so."""
 
 
 class PdrParams(LengthParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -164,7 +180,9 @@ class PhoneTrack(KernelEstimator):
         rate = p.rate_hz or context.rate_hz("acc") or 50.0
         steps.configure(s, p, rate)
         lengths.configure(s, p)
-        attitude.configure(s, rate, tau_acc=p.tau_acc_s, tau_mag=p.tau_mag_s)
+        turns = context.has("gyr") or not any(one.name == "gyr" for one in self.inputs)
+        s["has_mag"] = context.has("mag") and p.magnetometer != "off"
+        configure_attitude(self.name, s, p, rate, turns)
         for i, one in enumerate(self.inputs):
             s["role"][i] = ROLES[one.name]
         s["mode"] = direction.MODES.index(p.heading)
@@ -172,23 +190,23 @@ class PhoneTrack(KernelEstimator):
         mag_hz = context.rate_hz("mag") or rate
         s["median_w"] = min(64, max(1, round(p.median_s * min(mag_hz, rate))))
         s["fused"], s["has_gyr"] = self.fused, context.has("gyr")
-        s["has_mag"] = context.has("mag") and p.magnetometer != "off"
         calibrated = self._calibrate(context, s)
-        if p.magnetometer == "start" or (p.magnetometer == "auto" and not calibrated):
+        if turns and (p.magnetometer == "start" or (p.magnetometer == "auto" and not calibrated)):
             s["tau_mag"] = 1e5
         sigma = math.radians(p.sigma_heading_deg or (15.0 if calibrated or not s["has_mag"] else 35.0))
-        ringed = self.fused and not (calibrated and s["has_mag"])
         mixture.configure(
             s,
-            heading_known=not ringed,
+            heading_known=not self.fused,
             sigma_heading=sigma,
             sigma_scale=p.sigma_scale,
             sigma_drift=drift_sd(p, rate) * (1.0 if s["tau_mag"] > 1e4 or not s["has_mag"] else 0.1),
         )
-        if ringed and s["has_mag"]:
-            mixture.weigh(s, 0.0, sigma, 0.2)
-        s["q_length"], s["q_heading"] = p.sigma_length, math.radians(p.sigma_step_deg)
-        s["q_turn"], s["q_scale"], s["q_drift"] = math.radians(p.sigma_turn_deg), 0.003, 2e-5
+        if self.fused and s["has_mag"]:
+            mixture.weigh(s, 0.0, sigma, 0.05 if calibrated else 0.2)
+        alone = 1.0 if turns else FIELD_ALONE
+        s["q_length"], s["q_heading"] = p.sigma_length, math.radians(alone * p.sigma_step_deg)
+        s["q_turn"], s["q_scale"] = math.radians(alone * p.sigma_turn_deg), 0.003
+        s["q_drift"] = 2e-5
         if self.fused:
             s["gm_share"], s["gm_tau"], s["outlier"] = p.gnss_slow_share, p.gnss_tau_s, p.outlier
             s["sd_default"], s["sd_min"] = p.gnss_sd_m, p.gnss_sd_min_m
@@ -240,6 +258,32 @@ class PhoneTrack(KernelEstimator):
             )
         if s["has_gyr"] and s["gyr_ns"] == 0:
             remarks.append(Remark("no_gyroscope", "no sample of the gyroscope arrived: headings stand still"))
+        if s["mag_alone"]:
+            remarks.append(
+                Remark(
+                    "no_gyroscope",
+                    "there is no gyroscope: inclination and heading are those of the force and the field, for a "
+                    "phone that is carried steadily, away from iron; the stated deviations are larger",
+                )
+            )
+        if s["steps"] and s["doubt"] > DOUBTFUL * s["steps"]:
+            remarks.append(
+                Remark(
+                    "direction_doubtful",
+                    f"at {int(s['doubted'])} of {int(s['steps'])} steps the phone did not point ahead (the offset "
+                    f"found from the motion is {math.degrees(s['offset']):.0f}° at the end): with probability "
+                    f"{s['doubt'] / s['doubted']:.2f} the way is the opposite one"
+                    + ("" if self.fused else "; the stated sigma includes it, fixes decide it: phone.fused"),
+                )
+            )
+        if s["turned_about"]:
+            remarks.append(
+                Remark(
+                    "direction_changed",
+                    f"{int(s['turned_about'])} times the walking direction that is found from the motion, or whether "
+                    "the phone points ahead, changed: the phone was moved, or what came before was wrong",
+                )
+            )
         if not s["has_mag"] and not self.fused:
             remarks.append(
                 Remark("heading_relative", "no magnetometer is used: x is the direction of the first step")
@@ -270,6 +314,25 @@ class PhoneTrack(KernelEstimator):
                     Remark("lost_fixes", f"{int(s['lost_fixes'])} fixes came too fast and are left out")
                 )
         return remarks
+
+
+def configure_attitude(name: str, s: Any, p: PdrParams, rate: float, turns: bool) -> None:
+    """Configure the attitude in record ``s``; ``turns``: whether a gyroscope is there.
+
+    Raises
+    ------
+    AlgorithmError
+        There is neither a gyroscope nor a magnetometer: no heading can be had.
+    """
+    if turns:
+        attitude.configure(s, rate, tau_acc=p.tau_acc_s, tau_mag=p.tau_mag_s)
+    elif s["has_mag"] and p.heading != "gyroscope":
+        attitude.without_gyroscope(s, rate)
+    else:
+        raise AlgorithmError(
+            f"{name} needs a gyroscope{'' if p.heading == 'gyroscope' else ' or a magnetometer'} beside the "
+            "accelerometer for its headings; phone.steps counts steps without"
+        )
 
 
 def drift_sd(p: PdrParams, rate_hz: float) -> float:

@@ -13,7 +13,7 @@ from ..numerics.compiled import compiled
 from ..parameters import meta
 from . import attitude, direction, lengths, ring, steps
 from .lengths import LengthParams
-from .pdr import GYR, MAG, POSE, SourceParams, calibrated_field
+from .pdr import GYR, MAG, POSE, SourceParams, calibrated_field, configure_attitude
 from .steps import ACC
 
 STEP_COLUMNS = ("start_ns", "end_ns", "index", "length_m", "height_m", "heading_rad")
@@ -100,13 +100,11 @@ class PhoneAttitude(KernelEstimator):
         super().start(context)
         p, s = self.params, self.state[0]
         self.state[:] = np.zeros(1, self.state.dtype)
-        attitude.configure(
-            s,
-            p.rate_hz or context.rate_hz("acc") or 50.0,
-            tau_acc=p.tau_acc_s,
-            tau_mag=p.tau_mag_s,
-            rest_deg_s=p.rest_deg_s,
-        )
+        rate = p.rate_hz or context.rate_hz("acc") or 50.0
+        if context.has("gyr"):
+            attitude.configure(s, rate, tau_acc=p.tau_acc_s, tau_mag=p.tau_mag_s, rest_deg_s=p.rest_deg_s)
+        else:
+            attitude.without_gyroscope(s, rate)
         s["declination"] = math.radians(p.declination_deg)
         s["ref_norm"] = calibrated_field(context) or 0.0
 
@@ -213,8 +211,7 @@ class PhoneHeading(_OverSteps):
     title: ClassVar[str] = "walking direction of steps"
     source: ClassVar[str] = "phone dissertation, table 3.2; walking: Kourogi and Kurata 2014"
     Params = HeadingParams
-    optional_gyr: ClassVar[Input] = Input("gyr", GYR.schema, GYR.columns, optional=True, regular=True)
-    inputs = (ACC, optional_gyr, MAG, step_input("phone.steps"))
+    inputs = (ACC, GYR, MAG, step_input("phone.steps"))
     fields: ClassVar[list[tuple[Any, ...]]] = _HEADING_FIELDS
 
     def start(self, context: Context) -> None:
@@ -222,10 +219,10 @@ class PhoneHeading(_OverSteps):
         super().start(context)
         p, s = self.params, self.state[0]
         rate = p.rate_hz or context.rate_hz("acc") or 50.0
-        attitude.configure(s, rate, tau_acc=p.tau_acc_s, tau_mag=p.tau_mag_s)
+        s["has_mag"] = context.has("mag") and p.magnetometer != "off"
+        configure_attitude(self.name, s, p, rate, context.has("gyr"))
         s["mode"] = direction.MODES.index(p.heading)
         s["declination"] = math.radians(p.declination_deg)
-        s["has_mag"] = context.has("mag") and p.magnetometer != "off"
         s["median_w"] = min(64, max(1, round(p.median_s * (context.rate_hz("mag") or rate))))
         s["ref_norm"] = calibrated_field(context) or 0.0
 

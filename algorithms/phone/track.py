@@ -45,6 +45,13 @@ FIELDS: list[tuple[Any, ...]] = [
     ("part_heading", "f8"),
     ("lost_fixes", "i8"),
     ("tilted", "i8"),  # steps at which the screen did not look up
+    # Walking direction found from the motion
+    ("offset_now", "f8"),  # the offset of the newest step, 0 where the device's heading is taken
+    ("offset_var", "f8"),  # its variance that the track's covariance has in it (rad²)
+    ("doubted", "i8"),  # steps whose direction is found, or may be the opposite one
+    ("doubt", "f8"),  # sum of their probabilities of being the opposite one
+    ("turned_about", "i8"),
+    ("away", "f8", (2,)),  # way walked in such directions (m)
     ("far_fixes", "i8"),
     ("relocated", "i8"),
     ("sd_default", "f8"),
@@ -61,7 +68,7 @@ FIELDS: list[tuple[Any, ...]] = [
 ]
 
 # Columns of the result vector: step, pose, sigma, heading, detector, state, and of fused the fix.
-O_STEP, O_POSE, O_SIGMA, O_HEADING, O_DETECTOR = 0, 5, 12, 18, 23
+O_STEP, O_POSE, O_SIGMA, O_HEADING, O_DETECTOR = 0, 5, 12, 18, 25
 O_STATE = O_DETECTOR + ring.N_FEATURES
 O_FIX = O_STATE + 6
 
@@ -133,8 +140,45 @@ def _open_step(s: Any) -> None:
         heading = attitude.wrap(heading - s.turned)
     else:
         heading = attitude.wrap(heading - s.turned)
+    _doubt(s)
     s.part_on, s.part = 1, 0.0
     s.part_length, s.part_heading = length, heading
+
+
+@compiled
+def _doubt(s: Any) -> None:
+    """Take into the track how sure the walking direction is: its variance, and the opposite one."""
+    change = s.offset_sd**2 - s.offset_var
+    if change > 0.0:
+        s.offset_var += change
+        for h in range(s.hyp):
+            s.hP[h, 2, 2] += change
+    offset = s.offset if s.found == 1 else 0.0
+    jump = attitude.wrap(offset - s.offset_now)
+    turned = s.steps > 0 and abs(jump) > 0.35 * math.pi
+    s.offset_now = offset
+    if turned:
+        s.turned_about += 1
+    if s.fused == 1 and turned:  # the new direction, the old one, the opposite one
+        mixture.branch(s, -jump, 0.3)
+    if s.fused == 1 and (turned or s.steps == 0) and s.opposite > 0.0:
+        mixture.branch(s, math.pi, s.opposite)
+    if s.opposite > 0.0:
+        s.doubted += 1
+        s.doubt += s.opposite
+
+
+@compiled
+def _covariance(s: Any) -> tuple[float, float, float, float]:
+    """Return east, east-north, north and heading variance about the pose given.
+
+    Dead reckoning gives the more probable of two opposite directions: the other track is where it would have
+    gone from the same start, twice the way in doubt off.
+    """
+    p = s.doubt / s.doubted if s.doubted > 0 and s.fused == 0 else 0.0
+    k = 4.0 * p
+    x, y = s.away[0], s.away[1]
+    return s.cov[0] + k * x * x, s.cov[1] + k * x * y, s.cov[2] + k * y * y, s.cov[3] + p * math.pi**2
 
 
 @compiled
@@ -147,10 +191,11 @@ def _write_track(s: Any, t_ns: int, cause: int, out_message: Any, out_t_ns: Any,
     out[k, O_POSE], out[k, O_POSE + 1], out[k, O_POSE + 2] = s.mean[0], s.mean[1], s.height
     out[k, O_POSE + 3], out[k, O_POSE + 4] = math.cos(0.5 * heading), 0.0
     out[k, O_POSE + 5], out[k, O_POSE + 6] = 0.0, math.sin(0.5 * heading)
-    out[k, O_SIGMA], out[k, O_SIGMA + 1] = math.sqrt(s.cov[0]), math.sqrt(s.cov[2])
+    xx, xy, yy, turn = _covariance(s)
+    out[k, O_SIGMA], out[k, O_SIGMA + 1] = math.sqrt(xx), math.sqrt(yy)
     if s.pressure_n > 0:  # weather: about 0.03 m per root second
         out[k, O_SIGMA + 2] = math.sqrt(0.09 + 0.0009 * (t_ns - s.pressure_begin_ns) * 1e-9)
-    out[k, O_SIGMA + 5] = min(math.sqrt(s.cov[3]), math.pi)
+    out[k, O_SIGMA + 5] = min(math.sqrt(turn), math.pi)
     if s.fused == 1 and s.located == 1:
         lat, lon, _alt = geodesy.from_enu(s, s.mean[0], s.mean[1], 0.0)
         out[k, O_FIX], out[k, O_FIX + 1] = math.degrees(lat), math.degrees(lon)
@@ -160,7 +205,7 @@ def _write_track(s: Any, t_ns: int, cause: int, out_message: Any, out_t_ns: Any,
         out[k, O_FIX + 3], out[k, O_FIX + 4] = out[k, O_SIGMA], out[k, O_SIGMA + 1]
     out[k, O_STATE], out[k, O_STATE + 1] = s.mean[2], math.exp(s.mean[3])
     out[k, O_STATE + 2] = s.hyp
-    out[k, O_STATE + 3] = s.cov[1] / math.sqrt(max(s.cov[0] * s.cov[2], 1e-12))
+    out[k, O_STATE + 3] = xy / math.sqrt(max(xx * yy, 1e-12))
     out[k, O_STATE + 4], out[k, O_STATE + 5] = s.fixes, s.outliers
 
 
@@ -170,6 +215,9 @@ def _close_step(s: Any, cause: int, out_message: Any, out_t_ns: Any, out: Any, k
     mixture.step(s, end, s.part_length, s.part_heading, 1.0 - s.part)
     length = s.part_length * math.exp(s.mean[3])
     s.distance += length
+    if s.opposite > 0.0:
+        s.away[0] += s.part_length * math.cos(s.part_heading)
+        s.away[1] += s.part_length * math.sin(s.part_heading)
     _write_track(s, end, cause, out_message, out_t_ns, out, k)
     out[k, O_STEP], out[k, O_STEP + 1], out[k, O_STEP + 2] = (end - start) * 1e-9, s.steps, length
     out[k, O_STEP + 3] = s.height - s.height_step if s.pressure_n > 0 else np.nan
@@ -180,7 +228,8 @@ def _close_step(s: Any, cause: int, out_message: Any, out_t_ns: Any, out: Any, k
     out[k, O_HEADING + 1] = s.heading
     out[k, O_HEADING + 2] = s.ring[last, ring.MAG_YAW] if s.mag_n > 0 else np.nan
     out[k, O_HEADING + 3] = s.ring[last, ring.DISTURBED]
-    out[k, O_HEADING + 4] = s.offset
+    out[k, O_HEADING + 4], out[k, O_HEADING + 5] = s.offset, s.found
+    out[k, O_HEADING + 6] = s.opposite
     for j in range(ring.N_FEATURES):
         out[k, O_DETECTOR + j] = s.features[j]
     s.steps += 1

@@ -1,7 +1,9 @@
 """GetSensorData (IPIN): rows ``ACCE;app time;sensor time;…``, signals, and ``POSI``: surveyed positions.
 
-The app's clock (s since the start) is common to all rows but late by the time of handing over; the sensor's clock is
-exact with an origin of its own. Rows get the sensor's time, moved by the median difference of the two.
+The comment lines at the head declare the columns of each kind of row, which differ between the app's versions: they
+are believed where they are there. The app's clock (s since the start) is common to all rows but late by the time of
+handing over; the sensor's clock is exact with an origin of its own. Rows get the sensor's time, moved by the median
+difference of the two.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ from typing import ClassVar
 import numpy as np
 import polars as pl
 
-from ..contract import CommonOptions, Import, ReportBuilder
+from ..contract import HEAD_BYTES, CommonOptions, Import, ReportBuilder
 from ..inertial import one_file
 from ..phonelog import (
     ACC,
@@ -40,7 +42,7 @@ from ..phonelog import (
     whole_ns,
     xyz,
 )
-from ..text import read_blocks
+from ..text import read_blocks, start_of
 from ..typedrows import typed_blocks
 from .indoor_location import radio_columns, radio_frame
 
@@ -54,8 +56,8 @@ KINDS: dict[str, tuple[str, ...]] = {
     "AHRS": ("", "app", "t", "", "", "", "x", "y", "z"),
     "GNSS": ("", "app", "t", "lat", "lon", "alt", "", "accuracy"),
     "WIFI": ("", "app", "t", "", "mac", "rssi"),
-    "BLE4": ("", "app", "t", "", "mac", "rssi"),
-    "BLUE": ("", "app", "t", "", "mac", "rssi"),
+    "BLE4": ("", "app", "", "mac", "rssi"),
+    "BLUE": ("", "app", "", "mac", "rssi"),
     "POSI": ("", "app", "", "lat", "lon"),
 }
 _WIFI_NEW = ("", "app", "t", "", "mac", "frequency", "rssi")
@@ -71,6 +73,23 @@ _TOPICS = {
     "BLUE": "/phone/radio",
     "POSI": "/reference/fix",
 }
+_DECLARED = re.compile(r"'([A-Z0-9]{4});([^'\r\n]*)'?")
+_NAMES = (
+    (r"(?:app)?timestamp", "app"),
+    (r"sensortimestamp", "t"),
+    (r"(?:acc|gyr|mag)_([xyz])", ""),
+    (r"rotvec([xyz])", ""),
+    (r"quat\(([234])\)", ""),
+    (r"pres\(", "x"),
+    (r"lat", "lat"),
+    (r"lon", "lon"),
+    (r"alt", "alt"),
+    (r"accuracy\(m\)", "accuracy"),
+    (r"mac", "mac"),
+    (r"frequency", "frequency"),
+    (r"rssi?(?:\(|$)", "rssi"),
+)
+"""How the head names the columns that are read; without a name of ours the group is the axis."""
 _SAME_CLOCK_S = 0.5
 """Two clocks run alike where their difference varies less in a block."""
 
@@ -94,6 +113,7 @@ class GetSensorData:
         """Read one file."""
         path = one_file(paths, self.name)
         report = ReportBuilder()
+        stated = _declared(start_of(path, HEAD_BYTES))
         there: set[str] = set()
         for piece, _ in read_blocks(path):
             there |= {k for k in KINDS if piece.startswith(f"{k};".encode()) or f"\n{k};".encode() in piece}
@@ -101,7 +121,7 @@ class GetSensorData:
         streams = {topic: _stream(topic, report) for topic in topics}
         return Import(
             channels=declared(streams.values()),
-            blocks=_blocks(path, streams, report),
+            blocks=_blocks(path, streams, stated, report),
             report=report,
             metadata={
                 "device": {
@@ -113,6 +133,37 @@ class GetSensorData:
                 }
             },
         )
+
+
+def _declared(head: bytes) -> dict[str, tuple[str, ...]]:
+    """Return the columns of each kind as the comments declare them, up to the last that is read.
+
+    A kind that is declared twice (beacons of two makes) has its first columns in common.
+    """
+    found: dict[str, tuple[str, ...]] = {}
+    comments = [c for c in head.decode("utf-8", "replace").splitlines() if c.startswith("%")]
+    for kind, text in (m.groups() for c in comments if (m := _DECLARED.search(c))):
+        if kind not in KINDS or kind in found:
+            continue
+        names = [
+            kind,
+            *(n for n in text.split(";") if n.strip()),
+        ]  # "Mag_X(uT);;Mag_Y(uT)": a slip of the app
+        columns = ["", *(_column(n) for n in names[1:])]
+        if kind not in ("WIFI", "BLE4", "BLUE", "GNSS") and "accuracy" in columns:
+            columns[columns.index("accuracy")] = ""
+        if all(n in columns for n in KINDS[kind] if n and n not in ("t", "alt", "accuracy")):
+            last = max(i for i, n in enumerate(columns) if n)
+            found[kind] = tuple(columns[: last + 1])
+    return found
+
+
+def _column(name: str) -> str:
+    low = name.strip().lower()
+    for pattern, column in _NAMES:
+        if match := re.match(pattern, low):
+            return column or {"2": "x", "3": "y", "4": "z"}.get(match[1], match[1])
+    return ""
 
 
 def _stream(topic: str, report: ReportBuilder) -> Stream:
@@ -141,11 +192,14 @@ def _rotation(frame: pl.DataFrame) -> dict[str, np.ndarray]:
 
 
 def _blocks(
-    path: Path, streams: dict[str, Stream], report: ReportBuilder
+    path: Path, streams: dict[str, Stream], stated: dict[str, tuple[str, ...]], report: ReportBuilder
 ) -> Iterator[tuple[str, pl.DataFrame]]:
     offsets: dict[str, float | None] = {}
 
     def kinds(kind: str, width: int) -> Sequence[str] | None:
+        columns = stated.get(kind, ())
+        if columns and len(columns) <= width:
+            return columns
         return _WIFI_NEW if kind == "WIFI" and width >= 7 else KINDS.get(kind)
 
     tables = typed_blocks(

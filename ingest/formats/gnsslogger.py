@@ -1,4 +1,9 @@
-"""GnssLogger text: ``Fix,…``, ``UncalAccel,…`` … rows; the columns of each kind stand in ``#`` lines."""
+"""GnssLogger text: ``Fix,…``, ``UncalAccel,…`` … rows; the columns of each kind stand in ``#`` lines.
+
+Sensors have UTC in whole milliseconds and the time since boot in nanoseconds: rows get the latter, moved to UTC by the
+median difference. The satellite provider's fixes are taken where there are any, else the fused provider's, which
+are mostly the same positions again.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
 import polars as pl
 
 from ...recording.errors import MarchaError
@@ -19,11 +25,14 @@ from ..phonelog import (
     GYR,
     MAG,
     MICROTESLA,
+    QUAT,
+    QUATERNION,
     Stream,
     StreamChannel,
     declared,
     fix_part,
     imu_part,
+    quaternion_of,
     require_rows,
     whole_ns,
     xyz,
@@ -32,6 +41,9 @@ from ..text import read_blocks, start_of
 from ..typedrows import typed_blocks
 
 _SENSORS = {"Accel": "/phone/acc", "Gyro": "/phone/gyr", "Mag": "/phone/mag"}
+_ORIENTATION = "OrientationDeg"
+_SAME_CLOCK_NS = 20_000_000
+"""UTC and the time since boot run alike where their difference varies less in a block."""
 _FIX = {
     "latitude": "lat",
     "latitudedegrees": "lat",
@@ -70,14 +82,22 @@ class GnssLogger:
         report = ReportBuilder()
         attachments: list[SourceAttachment] = []
         there: set[str] = set()
+        providers: set[str] = set()
         for piece, _ in read_blocks(path):
             there |= {k for k in columns if f"\n{k},".encode() in piece}
+            providers |= {m.decode().upper() for m in re.findall(rb"(?m)^Fix,([A-Za-z]+),", piece)}
         streams: dict[str, Stream] = {}
         for kind in sorted(there):
             names = columns[kind]
             if kind == "Fix":
                 part = fix_part({k: k for k in ("lat", "lon", "alt", "accuracy", "vertical") if k in names})
                 streams[kind] = Stream([part], report, subject="fixes", even=False, attachments=attachments)
+                continue
+            if kind == _ORIENTATION:
+                part = StreamChannel(
+                    "/phone/orientation", QUATERNION, _rotation, QUAT, metadata={"north": "magnetic"}
+                )
+                streams[kind] = Stream([part], report, subject=part.topic)
                 continue
             topic = _SENSORS[kind.removeprefix("Uncal")]
             if topic in {p.topic for s in streams.values() for p in s.parts}:
@@ -91,16 +111,17 @@ class GnssLogger:
             streams[kind] = Stream([part], report, subject=topic)
         return Import(
             channels=declared(streams.values()),
-            blocks=_blocks(path, columns, streams, report),
+            blocks=_blocks(path, columns, streams, "GPS" if "GPS" in providers else "FLP", report),
             report=report,
             attachments=attachments,
             metadata={
                 "device": {
                     "clock": "utc",
-                    "time": "milliseconds since 1970",
+                    "time": "sensors: time since boot moved to UTC by the median difference; fixes: UTC",
                     "name": "GnssLogger",
                     "frames": AXES,
-                    "converted": "uncalibrated readings less the bias that Android states beside them; field from µT",
+                    "converted": "uncalibrated readings less the bias that Android states beside them; field from µT; "
+                    "yaw, roll, pitch (°, magnetic north) to a rotation",
                 }
             },
         )
@@ -116,10 +137,10 @@ def _columns(path: Path) -> dict[str, list[str]]:
         kind = cells[0]
         if kind == "Fix":
             columns[kind] = [_FIX.get(c.lower(), "") for c in cells]
-        elif kind.removeprefix("Uncal") in _SENSORS:
+        elif kind == _ORIENTATION or kind.removeprefix("Uncal") in _SENSORS:
             columns[kind] = [_sensor_column(c) for c in cells]
     for kind, names in columns.items():
-        wanted = ("t", "lat", "lon") if kind == "Fix" else ("t", "x", "y", "z")
+        wanted = _needed(kind)
         if any(n not in names for n in wanted):
             raise MarchaError(
                 f"{path}: the header of {kind} lacks time, axes or position; not a known version"
@@ -127,25 +148,63 @@ def _columns(path: Path) -> dict[str, list[str]]:
     return columns
 
 
+def _needed(kind: str) -> tuple[str, ...]:
+    return ("t", "lat", "lon") if kind == "Fix" else ("t", "x", "y", "z")
+
+
+def _rotation(frame: pl.DataFrame) -> dict[str, np.ndarray]:
+    yaw, roll, pitch = (np.radians(frame[c].to_numpy()) for c in "xyz")
+    return quaternion_of(yaw, pitch, roll)
+
+
 def _sensor_column(name: str) -> str:
     low = name.lower()
-    if low == "utctimemillis":
-        return "t"
-    bias = low.startswith("bias")
+    known = {
+        "utctimemillis": "t",
+        "elapsedrealtimenanos": "boot",
+        "yawdeg": "x",
+        "rolldeg": "y",
+        "pitchdeg": "z",
+    }
+    if low in known:
+        return known[low]
+    bias = low.startswith(("bias", "drift"))
     match = re.search(r"([xyz])(?:mps2|radpersec|microt)$", low)
     return (("bias_" if bias else "") + match[1]) if match else ""
 
 
+def _utc_ns(frame: pl.DataFrame, boot_ns: list[int]) -> pl.Series:
+    """Return the rows' times (ns): since boot moved to UTC where both are there and run alike, else UTC.
+
+    ``boot_ns`` keeps the UTC of boot, found in the first block that has both, for all kinds of rows.
+    """
+    utc = whole_ns(frame["t"], 1e3)
+    if "boot" not in frame.columns or not frame["boot"].is_finite().all():
+        return utc
+    since = frame["boot"].round().cast(pl.Int64)
+    gap = utc - since
+    middle = int(np.median(gap.to_numpy()))
+    if int(gap.max()) - int(gap.min()) > _SAME_CLOCK_NS:  # type: ignore[arg-type]
+        return utc
+    if not boot_ns:
+        boot_ns.append(middle)
+    return since + (boot_ns[0] if abs(middle - boot_ns[0]) < _SAME_CLOCK_NS else middle)
+
+
 def _blocks(
-    path: Path, columns: dict[str, list[str]], streams: dict[str, Stream], report: ReportBuilder
+    path: Path,
+    columns: dict[str, list[str]],
+    streams: dict[str, Stream],
+    provider: str,
+    report: ReportBuilder,
 ) -> Iterator[tuple[str, pl.DataFrame]]:
+    boot_ns: list[int] = []
+
     def kinds(kind: str, width: int) -> Sequence[str] | None:
         if kind not in streams:
             return None
         names = columns[kind]
-        needed = 1 + max(
-            names.index(n) for n in (("t", "lat", "lon") if kind == "Fix" else ("t", "x", "y", "z"))
-        )
+        needed = 1 + max(names.index(n) for n in _needed(kind))
         return names[: max(width, needed)]  # old versions leave out trailing cells that their header names
 
     tables = typed_blocks(
@@ -153,13 +212,13 @@ def _blocks(
     )
     for block in tables:
         for kind, frame in block.items():
-            frame = frame.with_columns(t=whole_ns(frame["t"], 1e3))
+            frame = frame.with_columns(t=_utc_ns(frame, boot_ns))
             if kind == "Fix" and "provider" in frame.columns:
-                gps = frame["provider"].str.to_uppercase().is_in(["GPS", "FLP"])
+                gps = frame["provider"].str.to_uppercase() == provider
                 if not gps.all():
                     report.drop(
                         "other_provider",
-                        "fixes of the network provider are left out",
+                        f"fixes of other providers than {provider} are left out",
                         count=int((~gps).sum()),
                         line=int(frame["line"][int((~gps).arg_true()[0])]),
                     )

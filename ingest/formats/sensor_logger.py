@@ -7,6 +7,7 @@ acceleration and gravity have the opposite sign unless "Standardise Units & Fram
 from __future__ import annotations
 
 import contextlib
+import math
 import sqlite3
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -29,6 +30,8 @@ from ..phonelog import (
     MAG,
     MICROTESLA,
     PRESSURE,
+    QUAT,
+    QUATERNION,
     VALUES,
     SourceColumn,
     Stream,
@@ -45,9 +48,18 @@ WANTED = "time,seconds_elapsed,z,y,x"
 READ = (
     "Accelerometer", "TotalAcceleration", "Gravity", "AccelerometerUncalibrated", "Gyroscope",
     "GyroscopeUncalibrated", "Magnetometer", "MagnetometerUncalibrated", "Location", "LocationGps", "Barometer",
-    "Pedometer",
+    "Pedometer", "Orientation",
 )  # fmt: skip
 _TEXT = ("sensor", "name", "text", "standardisation")
+_NUMBERS = {
+    "time", "seconds_elapsed", "x", "y", "z", "latitude", "longitude", "altitude", "horizontalAccuracy",
+    "verticalAccuracy", "pressure", "steps", "qw", "qx", "qy", "qz",
+}  # fmt: skip
+"""Columns that are read; others may be text, as the times for people that the app writes if told to."""
+_Q = ("qw", "qx", "qy", "qz")
+_AGREES, _CLEARER = np.radians(20.0), np.radians(60.0)
+"""An orientation is believed whose vertical lies as near to the measured force, in the median; and the other
+platform's north where it is so much nearer to the field, which iron in the phone turns."""
 
 
 class SensorLoggerOptions(CommonOptions, frozen=True, kw_only=True):
@@ -110,7 +122,7 @@ class SensorLogger:
             )
             platform = "android"
         turned = platform == "ios" and not standard
-        streams = list(_streams(path, tables, turned, report, attachments))
+        streams = list(_streams(path, tables, turned, platform, report, attachments))
         return Import(
             channels=declared(s for s, _ in streams),
             blocks=_blocks(path, streams),
@@ -175,7 +187,8 @@ def _first_row(file: Path) -> dict[str, str]:
 def _csv(file: Path, report: ReportBuilder) -> pl.DataFrame | None:
     header = require_header(file, _is_header, WANTED)
     try:
-        blocks = list(float_blocks(file, header, "time", report, integers=("time",), texts=_TEXT))
+        texts = [n for n in header.names if n not in _NUMBERS]
+        blocks = list(float_blocks(file, header, "time", report, integers=("time",), texts=texts))
     except MarchaError as error:
         if "ends before its first row" not in str(error):
             raise
@@ -236,6 +249,7 @@ def _streams(
     path: Path,
     tables: dict[str, pl.DataFrame],
     turned: bool,
+    platform: str,
     report: ReportBuilder,
     attachments: list[SourceAttachment],
 ) -> Iterator[tuple[Stream, pl.DataFrame]]:
@@ -284,6 +298,72 @@ def _streams(
     if "Pedometer" in tables and "steps" in tables["Pedometer"].columns:
         part = StreamChannel("/phone/steps", VALUES, {"steps": SourceColumn("steps", 1.0)}, ("steps",))
         yield Stream([part], report, subject="Pedometer", even=False), tables["Pedometer"]
+
+    oriented = _orientation(tables, acc[1] if acc is not None else None, platform, report)
+    if oriented is not None:
+        north, frame = oriented
+        columns: dict[str, SourceColumn] = {q: SourceColumn(q, 1.0) for q in QUAT}
+        part = StreamChannel("/phone/orientation", QUATERNION, columns, metadata={"north": north})
+        yield Stream([part], report, subject="Orientation"), frame
+
+
+def _orientation(
+    tables: dict[str, pl.DataFrame], acc: pl.DataFrame | None, platform: str, report: ReportBuilder
+) -> tuple[str, pl.DataFrame] | None:
+    """Return the phone's own orientation as ``rot_nb`` (n: east, north, up), and which north it has.
+
+    The quaternion takes b to n or back, and its n has x east (Android) or north (iOS): of these the one is taken whose
+    vertical is the measured force and whose north is the measured field; without a field, the platform's.
+    """
+    table = tables.get("Orientation")
+    if table is None or not table.height or acc is None or not acc.height:
+        return None
+    if any(q not in table.columns for q in _Q):
+        return None
+    values = table.select(_Q[1:] + _Q[:1]).to_numpy()
+    good = np.isfinite(values).all(axis=1) & (np.linalg.norm(values, axis=1) > 0.1)
+    table, values = table.filter(pl.Series(good)), values[good]
+    if not len(values):
+        return None
+    from scipy.spatial.transform import Rotation
+
+    to_east = Rotation.from_euler("z", 90, degrees=True)
+    force, field = _beside(acc, table), _beside(tables.get("Magnetometer"), table)
+    best: tuple[tuple[float, float], Any] | None = None
+    ios = platform == "ios"
+    for inverse, north in ((False, ios), (True, ios), (False, not ios), (True, not ios)):
+        turn = Rotation.from_quat(values)
+        turn = turn.inv() if inverse else turn
+        turn = to_east * turn if north else turn
+        up = turn.apply(force)[:, 2] / np.linalg.norm(force, axis=1)
+        tilt = float(np.nanmedian(np.arccos(np.clip(up, -1, 1))))
+        aside = 0.0
+        if field is not None:
+            east, ahead = turn.apply(field)[:, :2].mean(axis=0)
+            aside = abs(math.atan2(east, ahead))
+        if tilt <= _AGREES and (best is None or aside < best[0][1] - _CLEARER):
+            best = (tilt, aside), turn
+    if best is None:
+        report.loss(
+            "odd_orientation",
+            "Orientation: its vertical is not that of the acceleration, turned either way: left out",
+            count=len(values),
+        )
+        return None
+    x, y, z, w = best[1].as_quat(canonical=True).T
+    made = dict(zip(QUAT, (w, x, y, z), strict=True))
+    frame = table.select("t", "line").with_columns(pl.Series(k, v) for k, v in made.items())
+    return "true" if platform == "ios" else "magnetic", frame
+
+
+def _beside(table: pl.DataFrame | None, times: pl.DataFrame) -> np.ndarray | None:
+    """Return the three axes of ``table`` at the times of another one, shape (n, 3)."""
+    if table is None or not table.height or any(a not in table.columns for a in "xyz"):
+        return None
+    table = table.sort("t")
+    return np.column_stack(
+        [np.interp(times["t"].to_numpy(), table["t"].to_numpy(), table[a].to_numpy()) for a in "xyz"]
+    )
 
 
 def _acceleration(
