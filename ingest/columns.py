@@ -24,6 +24,8 @@ PREAMBLE_LINES = 200
 MISSING = ("", "-", "nan", "na", "null", "none", "inf", "-inf")
 """Cells (lower case) that say that there is no value."""
 _MISSING_AS_WRITTEN = ("", "-", "nan", "NaN", "NA", "null", "NULL", "None", "inf", "-inf")
+_NAMED = re.compile(r"[A-DF-Za-df-z\u0080-\U0010ffff]")
+"""A header has letters other than a number's exponent."""
 _LINE_END = re.compile(r"\r\n|\n|\r")
 _COMMA = re.compile(r"^[+-]?\d+,\d+([eE][+-]?\d+)?$")
 _POINT = re.compile(r"^[+-]?\d*\.\d+([eE][+-]?\d+)?$")
@@ -68,9 +70,11 @@ def find_header(head: bytes, accept: Callable[[Sequence[str]], bool]) -> Header 
 def _rows_of_cells(head: bytes) -> tuple[tuple[int, str, tuple[str, ...]], ...]:
     """Return line, separator and cells of what may be a header; kept, because many formats ask of one file."""
     text = head.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "replace")
+    lines = enumerate(_LINE_END.split(text, PREAMBLE_LINES)[:PREAMBLE_LINES], 1)
     return tuple(
         (number, separator, tuple(c.strip().strip('"') for c in line.split(separator)))
-        for number, line in enumerate(_LINE_END.split(text, PREAMBLE_LINES)[:PREAMBLE_LINES], 1)
+        for number, line in lines
+        if _NAMED.search(line)
         for separator in (",", ";", "\t")
         if separator in line
     )

@@ -210,8 +210,9 @@ class _Merged:
         self._clocks |= {spec.topic: name for spec in specs} | imported.metadata.pop("clocks", {})
         for key, record in _metadata(imported, options, truth).items():
             self._records[key if key not in self._records else f"{key}/{name}"] = record
-        if imported.annotations is not None:
-            self.annotations.append(written.moved(imported.annotations))
+        for marks in (imported.annotations, truth.annotations if truth else None):
+            if marks is not None:
+                self.annotations.append(written.moved(marks))
         raw = _raw(source.files) if options.keep_source else ()
         names = {a.name for a in self.attachments}  # what the user names beside a log goes before its own
         self.attachments += [a for a in (*imported.attachments, *raw) if a.name not in names]

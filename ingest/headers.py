@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +61,7 @@ class TableHeader:
         return columns
 
 
+@lru_cache(maxsize=1024)
 def plain(name: str) -> str:
     """Return a column's name in lower case, without unit, words apart by one blank."""
     bare = UNIT.sub(" ", name.strip().strip('"').lower())

@@ -7,6 +7,7 @@ the foot is still; it becomes ``/reference/pose``, ``/reference/velocity`` and `
 ``/reference/joint`` and ``/reference/<segment>/orientation``.
 ``<stem>.truth.fix.csv`` has ``t_ns``, latitude, longitude (deg) and height of the same walk, for ``/reference/fix``.
 ``<stem>.truth.steps.csv`` has the steps of a person with a phone, for ``/reference/steps``; stance is left out.
+``<stem>.truth.marks.csv`` has annotations: ``tier,start_ns,end_ns,label``.
 ``<stem>.truth.toml`` holds facts (closed, length_m, scenario, seed …) for the metadata record ``truth``.
 """
 
@@ -81,11 +82,14 @@ class TruthFile(msgspec.Struct, frozen=True):
         ``closed``, ``length_m``, ``scenario``, ``seed`` …
     tables : dict of ChannelSpec to polars.DataFrame
         The reference channels.
+    annotations : polars.DataFrame or None
+        Tiers with their labels.
     """
 
     files: tuple[Path, ...]
     metadata: dict[str, str]
     tables: list[tuple[ChannelSpec, pl.DataFrame]]
+    annotations: pl.DataFrame | None = None
 
 
 def is_side_file(path: Path) -> bool:
@@ -127,11 +131,15 @@ def read_truth(path: Path) -> TruthFile | None:
     if (file := path.with_name(f"{path.stem}.truth.leg.csv")).is_file() and path.suffix != ".trc":
         files.append(file)
         tables += _leg(file)
+    marks = None
+    if (file := path.with_name(f"{path.stem}.truth.marks.csv")).is_file():
+        files.append(file)
+        marks = _marks(file)
     if facts:  # a capture's truth comes with its inertial log
         files.append(facts_file)
     if not files:
         return None
-    return TruthFile(tuple(files), facts, tables)
+    return TruthFile(tuple(files), facts, tables, marks)
 
 
 def _leg(file: Path) -> Iterator[tuple[ChannelSpec, pl.DataFrame]]:
@@ -186,6 +194,17 @@ def _steps(file: Path) -> pl.DataFrame:
         raise MarchaError(f"{file}: not a readable table of steps: {str(error).splitlines()[0]}") from error
     if table.null_count().sum_horizontal().item() or not table["t_ns"].is_sorted():
         raise MarchaError(f"{file}: a table of steps has no empty cells and its time never decreases")
+    return table
+
+
+def _marks(file: Path) -> pl.DataFrame:
+    columns = {"tier": pl.String, "start_ns": pl.Int64, "end_ns": pl.Int64, "label": pl.String}
+    try:
+        table = pl.read_csv(file, schema_overrides=columns).select(*columns)
+    except (OSError, pl.exceptions.PolarsError) as error:
+        raise MarchaError(f"{file}: not a readable table of labels: {str(error).splitlines()[0]}") from error
+    if table.null_count().sum_horizontal().item() or (table["end_ns"] < table["start_ns"]).any():
+        raise MarchaError(f"{file}: a table of labels has no empty cells, and none ends before it starts")
     return table
 
 

@@ -32,6 +32,7 @@ from ..replay.results import Run
 from ..replay.runs import warm_up
 from ..replay.specs import EstimatorSpec
 from .plan import Job, StudyRecording, StudyTask
+from .withheld import stretches
 
 #: Points that are kept of a track: enough for a figure, small enough for hundreds of walks.
 TRACK_POINTS = 400
@@ -219,12 +220,13 @@ def _run(rec: Recording, task: StudyTask, jobs: Sequence[Job], topics: list[str]
         )
         for number, job in enumerate(jobs)
     ]
+    kept_back = stretches(task.withhold, rec)
     if task.by:
         with scratch_folder() as folder:
-            result = replay(rec, specs, inputs=topics, out=folder / "done.mcap")
+            result = replay(rec, specs, inputs=topics, out=folder / "done.mcap", withhold=kept_back)
             by_label = _by_label(open_recording(folder / "done.mcap"), task.by)
     else:
-        result, by_label = replay(rec, specs, inputs=topics), {}
+        result, by_label = replay(rec, specs, inputs=topics, withhold=kept_back), {}
     imported = _import_findings(rec)
     cells: list[StudyCell] = []
     for run in result.runs:

@@ -20,6 +20,7 @@ import msgspec
 from ..algorithms import available
 from ..recording import MarchaError, UsageError
 from ..recording.files import parse_toml, read_small
+from .withheld import Withheld
 
 NonNegative = Annotated[int, msgspec.Meta(ge=0)]
 _PACKAGE = __name__.rpartition(".")[0]
@@ -29,9 +30,9 @@ Level = str | bool | int | float
 """Value of a parameter that is a factor."""
 
 RESERVED = (
-    *("metric", "unit", "filter", "configuration", "recording", "input", "estimator", "preset", "params"),
-    *("status", "error", "clipped", "value"),
-)
+    "metric", "unit", "filter", "configuration", "recording", "input", "estimator", "preset", "params",
+    "status", "error", "clipped", "value",
+)  # fmt: skip
 """Columns of the tables that no factor may be called by."""
 
 
@@ -292,6 +293,8 @@ class StudyConfig(_Table, frozen=True, kw_only=True):
     by : str
         Tier of annotations (``terrain``, ``turn``): the metrics are also taken by its labels and between them,
         and compared. A rule of this name (``turn``, ``stair`` …) is applied where a recording has no such tier.
+    withhold : list of Withheld
+        Stretches of channels that no estimator gets; errors are taken against them.
     """
 
     title: str = "Study"
@@ -308,6 +311,7 @@ class StudyConfig(_Table, frozen=True, kw_only=True):
     verdicts: list[Verdict] = []
     tracks: bool = True
     by: str = ""
+    withhold: list[Withheld] = []
 
 
 class Method(msgspec.Struct, frozen=True):
@@ -462,13 +466,8 @@ def _grid(config: StudyConfig) -> Iterator[Method]:
         levels = _levels(config, entry)
         for preset, values in itertools.product(entry.presets or [""], itertools.product(*axes.values())):
             params = dict(zip(axes, values, strict=True))
-            label = " ".join(
-                [
-                    entry.label or entry.name,
-                    *([preset] if len(entry.presets) > 1 and preset else []),
-                    *(f"{k}={params[k]}" for k in varying),
-                ]
-            )
+            named = [preset] if len(entry.presets) > 1 and preset else []
+            label = " ".join([entry.label or entry.name, *named, *(f"{k}={params[k]}" for k in varying)])
             for chosen in itertools.product(*levels.values()):
                 setting = dict(zip(levels, map(str, chosen), strict=True))
                 yield Method(entry.name, label, setting, preset, params)

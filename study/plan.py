@@ -23,6 +23,7 @@ from ..algorithms import available, make
 from ..algorithms.contract import AlgorithmError
 from ..recording import UsageError
 from . import config as cfg
+from .withheld import Withheld
 
 
 class StudyRecording(msgspec.Struct, frozen=True):
@@ -98,6 +99,8 @@ class StudyTask(msgspec.Struct, frozen=True):
         Where converted and simulated recordings are kept.
     by : str
         Tier by whose labels is measured as well.
+    withhold : list of Withheld
+        What the estimators do not get.
     """
 
     name: str
@@ -106,6 +109,7 @@ class StudyTask(msgspec.Struct, frozen=True):
     inputs: list[str]
     folder: str
     by: str = ""
+    withhold: list[Withheld] = []
 
 
 def digest(*parts: Any) -> str:
@@ -277,8 +281,9 @@ def _walks(simulate: cfg.Simulate, code: str) -> list[StudyRecording]:
 
 def jobs(config: cfg.StudyConfig, source: StudyRecording) -> list[Job]:
     """Return every method on one recording with its key."""
+    more = [config.withhold] if config.withhold else []  # else the keys of older studies stay
     return [
-        Job(digest(source.digest, source.name, config.inputs, method, config.by), method)
+        Job(digest(source.digest, source.name, config.inputs, method, config.by, *more), method)
         for method in cfg.methods(config)
     ]
 
@@ -323,6 +328,7 @@ def tasks(
                     inputs=config.inputs,
                     folder=str(folder),
                     by=config.by,
+                    withhold=config.withhold,
                 )
             )
     # The largest first: no long task is left for the end.

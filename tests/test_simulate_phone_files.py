@@ -33,6 +33,13 @@ def test_a_format_gives_the_walk_back(tmp_path: Path, format: str) -> None:
     pose = rec.table("/reference/pose")
     assert np.allclose(pose.select("pos_x", "pos_y", "pos_z").to_numpy(), walk.pos, atol=1e-9)
     assert rec.metadata["truth"]["steps"] == str(walk.steps.height)
+    marks = rec.annotations
+    assert marks.filter(tier="placement")["label"].to_list() == ["pocket"]
+    activity = marks.filter(tier="activity")
+    assert activity["label"].to_list() == ["standing", "walking", "standing"]
+    walked = activity.filter(label="walking").row(0, named=True)
+    assert abs(walked["start_ns"] + origin - int(walk.steps["start_ns"][0])) < 30_000_000
+    assert abs(walked["end_ns"] + origin - int(walk.steps["end_ns"][-1])) < 30_000_000
 
 
 def test_files_are_not_replaced_unasked(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from marcha.study import study as study_module
 from marcha.study.cells import cached
 from marcha.study.config import Metric, Recordings
 from marcha.study.plan import find_sources
+from marcha.study.withheld import Withheld
 
 CONFIG = """
 title = "Two <filters> & two sensors"
@@ -397,3 +398,31 @@ def test_metrics_by_label_are_compared_walk_by_walk(
     assert (pairs["difference"] < 0).all()  # less way in the turns than along the sides
     assert (tmp_path / "out" / "labels.csv").is_file()
     assert "By turn" in (tmp_path / "out" / "report.html").read_text("utf-8")
+
+
+PHONES = """
+[simulate]
+scenarios = ["phone-100m"]
+seed = 5
+options = { format = "phyphox", rate_hz = 20.0, pressure_hz = 0.0, gnss_sigma_m = 4.0 }
+configurations = { hand = { placement = "hand", walks = 1 }, pocket = { placement = "pocket", walks = 1 } }
+
+[[estimators]]
+name = "phone.fused"
+"""
+
+
+def test_a_loss_of_gps_and_the_carrying_mode_are_part_of_a_study(
+    fixed_code: None, no_figures: None, tmp_path: Path
+) -> None:
+    """The fixes that are withheld are what the end of the loss is measured against; labels are the simulator's."""
+    base = msgspec.toml.decode(PHONES, type=StudyConfig)
+    loss = Withheld(topic="/phone/gnss", start_s=30.0, length_s=30.0)
+    lost = msgspec.structs.replace(base, withhold=[loss], by="placement")
+    found = run_study(lost, tmp_path / "lost", workers=1)
+    assert found.results["status"].to_list() == ["ok", "ok"]
+    assert (found.results["loss_error_m"] > 0).all()
+    assert set(found.labels["label"]) == {"hand", "pocket"}
+    sources = find_sources(base, None, "code")[0]
+    keys = [plan.jobs(c, sources[0])[0].key for c in (base, lost)]
+    assert keys[0] != keys[1]  # a study without the loss does not take results with it

@@ -126,6 +126,7 @@ def steps(rec: Recording, fig: Figure) -> None:
         lengths.bar(np.arange(1, len(t) + 1), length, color=color, alpha=0.7, label=_owner(topic))
         way.step(np.arange(1, len(t) + 1), np.nancumsum(length), color=color, label=_owner(topic))
     _dress(top, "steps along the norm", TIME, "m/s²")
+    lengths.set_ylim(top=1.3 * lengths.get_ylim()[1])  # room for the legend
     _dress(lengths, "step lengths", "step", "m")
     _dress(way, "distance so far", "step", "m")
 
@@ -153,6 +154,7 @@ def heading(rec: Recording, fig: Figure) -> None:
         name = f"{_owner(topic)} {column.removesuffix('_rad')}"
         axes[-1].plot(_s(rec, table), turned, color=style.axis_color(i), linewidth=1.0, label=name)
     _dress(axes[-1], "heading (unwrapped)", TIME, "°")
+    axes[-1].legend(fontsize=7, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.18))  # many lines: below
 
 
 def fixes(rec: Recording, fig: Figure) -> None:

@@ -1,8 +1,9 @@
 """The track as a mixture of Gaussian hypotheses: steps carry it, fixes weigh and correct it.
 
 State of a hypothesis: position east, north (m), heading correction (rad, added to the steps' headings),
-logarithm of the length's scale, the slow error of the fixes (m), a Gauss–Markov process, and the rate at which
-the headings drift (rad/s: the gyroscope's bias about the vertical). An unknown initial
+logarithm of the length's scale, the slow error of the fixes, a Gauss–Markov process in units of what each fix states
+(so that a fix of 20 m is not off by the error of one of 600 m before it), and the rate at which the headings drift
+(rad/s: the gyroscope's bias about the vertical). An unknown initial
 heading is a ring of hypotheses, not a linearization. A fix is an inlier or an outlier with stated
 probabilities; each hypothesis is corrected by its inlier's share (probabilistic data association, Bar-Shalom), so
 that a fix far off moves nothing and a doubtful one a little, with the covariance to match.
@@ -25,6 +26,8 @@ FIELDS: list[tuple[Any, ...]] = [
     ("hP", "f8", (HYPOTHESES, N, N)),
     ("hw", "f8", (HYPOTHESES,)),
     ("work", "f8", (2, N)),
+    ("ringed", "i8"),  # whether the hypotheses are the ring that they were at the start, none dropped
+    ("before", "f8", (HYPOTHESES,)),
     ("located", "i8"),
     ("moved_ns", "i8"),
     ("q_length", "f8"),  # relative standard deviation of a step's length
@@ -34,7 +37,6 @@ FIELDS: list[tuple[Any, ...]] = [
     ("q_drift", "f8"),  # growth of the drift, rad/s per √s
     ("gm_share", "f8"),  # share of the slow error in a fix's variance
     ("gm_tau", "f8"),
-    ("gm_sd", "f8"),  # stationary standard deviation of the slow error now modelled (m)
     ("outlier", "f8"),
     ("mean", "f8", (4,)),  # mixture: east, north, heading correction, scale
     ("cov", "f8", (4,)),  # east, east-north, north; variance of the heading correction
@@ -48,12 +50,13 @@ def configure(
 ) -> None:
     """Start the hypotheses in record ``s``: one where the heading is known, else a ring of them."""
     count = 1 if heading_known else HYPOTHESES
-    s["hyp"] = count
+    s["hyp"], s["ringed"] = count, 0 if heading_known else 1
     for h in range(count):
         turn = 2 * math.pi * h / count
         s["hx"][h, 2] = turn - 2 * math.pi if turn > math.pi else turn
         s["hP"][h, 2, 2] = sigma_heading**2 if heading_known else (math.pi / count) ** 2
         s["hP"][h, 3, 3] = sigma_scale**2
+        s["hP"][h, 4, 4] = s["hP"][h, 5, 5] = 1.0
         s["hP"][h, 6, 6] = sigma_drift**2
         s["hw"][h] = 1.0 / count
 
@@ -72,14 +75,14 @@ def weigh(s: Any, center: float, sigma: float, share: float) -> None:
 def branch(s: Any, turn: float, share: float) -> None:
     """Let every hypothesis be wrong by ``turn`` (rad) with probability ``share``, as far as there is room.
 
-    A ring of hypotheses has that turn in it already: then the weights are shared out.
+    A whole ring of hypotheses has one near that turn already: then the weights are shared out.
     """
-    if s.hyp == HYPOTHESES:
-        half = HYPOTHESES // 2
-        if abs(abs(turn) - math.pi) < 1e-6:
-            for h in range(half):
-                a, b = s.hw[h], s.hw[h + half]
-                s.hw[h], s.hw[h + half] = (1.0 - share) * a + share * b, (1.0 - share) * b + share * a
+    if s.ringed == 1:
+        by = round(turn / (2.0 * math.pi / HYPOTHESES))
+        for h in range(HYPOTHESES):
+            s.before[h] = s.hw[h]
+        for h in range(HYPOTHESES):
+            s.hw[h] = (1.0 - share) * s.before[h] + share * s.before[(h - by) % HYPOTHESES]
         return
     for h in range(s.hyp):
         if s.hyp < HYPOTHESES:
@@ -133,10 +136,10 @@ def age(s: Any, t_ns: int) -> None:
         for j in range(N):
             s.hP[h, j, 2] += dt * s.hP[h, j, 6]
         s.hP[h, 6, 6] += dt * s.q_drift**2
-    if s.gm_sd == 0.0:
+    if s.gm_tau == 0.0:
         return
     keep = math.exp(-dt / s.gm_tau)
-    add = s.gm_sd**2 * (1.0 - keep * keep)
+    add = 1.0 - keep * keep
     for h in range(s.hyp):
         for i in range(4, 6):
             s.hx[h, i] *= keep
@@ -153,28 +156,23 @@ def fix(s: Any, t_ns: int, east: float, north: float, sd: float) -> None:
     age(s, t_ns)
     s.fixes += 1
     slow, white = sd * math.sqrt(s.gm_share), sd * sd * (1.0 - s.gm_share)
-    if s.gm_sd == 0.0 or s.located == 0:
-        for h in range(s.hyp):
-            for i in range(4, 6):
-                s.hP[h, i, i] = slow * slow
-    s.gm_sd = slow if s.located == 0 else s.gm_sd + 0.2 * (slow - s.gm_sd)
     if s.located == 0:
         s.located = 1
         for h in range(s.hyp):  # the walked way so far is about an unknown origin
             s.hP[h, 0, 0] += 1e8
             s.hP[h, 1, 1] += 1e8
         for h in range(s.hyp):
-            _correct(s, h, east, north, white, 1.0)
+            _correct(s, h, east, north, slow, white, 1.0)
         summarize(s)
         return
     total, outside = 0.0, 0.0
     for h in range(s.hyp):
-        p_in, p_out = _likelihoods(s, h, east, north, white)
+        p_in, p_out = _likelihoods(s, h, east, north, slow, white)
         share = (1.0 - s.outlier) * p_in / ((1.0 - s.outlier) * p_in + s.outlier * p_out)
         s.hw[h] *= (1.0 - s.outlier) * p_in + s.outlier * p_out
         total += s.hw[h]
         outside += s.hw[h] * (1.0 - share)
-        _correct(s, h, east, north, white, share)
+        _correct(s, h, east, north, slow, white, share)
     s.outliers += outside / total if total > 0.0 else 1.0
     for h in range(s.hyp):
         s.hw[h] = s.hw[h] / total if total > 0.0 else 1.0 / s.hyp
@@ -183,10 +181,10 @@ def fix(s: Any, t_ns: int, east: float, north: float, sd: float) -> None:
 
 
 @compiled
-def _innovation(s: Any, h: int, white: float) -> tuple[float, float, float]:
-    a = s.hP[h, 0, 0] + 2.0 * s.hP[h, 0, 4] + s.hP[h, 4, 4] + white
-    b = s.hP[h, 0, 1] + s.hP[h, 0, 5] + s.hP[h, 4, 1] + s.hP[h, 4, 5]
-    c = s.hP[h, 1, 1] + 2.0 * s.hP[h, 1, 5] + s.hP[h, 5, 5] + white
+def _innovation(s: Any, h: int, g: float, white: float) -> tuple[float, float, float]:
+    a = s.hP[h, 0, 0] + 2.0 * g * s.hP[h, 0, 4] + g * g * s.hP[h, 4, 4] + white
+    b = s.hP[h, 0, 1] + g * (s.hP[h, 0, 5] + s.hP[h, 4, 1]) + g * g * s.hP[h, 4, 5]
+    c = s.hP[h, 1, 1] + 2.0 * g * s.hP[h, 1, 5] + g * g * s.hP[h, 5, 5] + white
     return a, b, c
 
 
@@ -198,21 +196,21 @@ def _density(x: float, y: float, a: float, b: float, c: float) -> float:
 
 
 @compiled
-def _likelihoods(s: Any, h: int, east: float, north: float, white: float) -> tuple[float, float]:
+def _likelihoods(s: Any, h: int, east: float, north: float, g: float, white: float) -> tuple[float, float]:
     """Densities of a fix as inlier, and as outlier (the same with 50 m more an axis)."""
-    x, y = east - s.hx[h, 0] - s.hx[h, 4], north - s.hx[h, 1] - s.hx[h, 5]
-    a, b, c = _innovation(s, h, white)
+    x, y = east - s.hx[h, 0] - g * s.hx[h, 4], north - s.hx[h, 1] - g * s.hx[h, 5]
+    a, b, c = _innovation(s, h, g, white)
     return _density(x, y, a, b, c), _density(x, y, a + 2500.0, b, c + 2500.0) + 1e-30
 
 
 @compiled
-def _correct(s: Any, h: int, east: float, north: float, white: float, share: float) -> None:
+def _correct(s: Any, h: int, east: float, north: float, g: float, white: float, share: float) -> None:
     """Kalman update by the inlier's share β: x + β K ν, P − β K S Kᵀ + β (1 − β) K ν νᵀ Kᵀ."""
-    x, y = east - s.hx[h, 0] - s.hx[h, 4], north - s.hx[h, 1] - s.hx[h, 5]
-    a, b, c = _innovation(s, h, white)
+    x, y = east - s.hx[h, 0] - g * s.hx[h, 4], north - s.hx[h, 1] - g * s.hx[h, 5]
+    a, b, c = _innovation(s, h, g, white)
     det = a * c - b * b
     for i in range(N):
-        u, v = s.hP[h, i, 0] + s.hP[h, i, 4], s.hP[h, i, 1] + s.hP[h, i, 5]
+        u, v = s.hP[h, i, 0] + g * s.hP[h, i, 4], s.hP[h, i, 1] + g * s.hP[h, i, 5]
         s.work[0, i], s.work[1, i] = (u * c - v * b) / det, (v * a - u * b) / det
     for i in range(N):
         s.hx[h, i] += share * (s.work[0, i] * x + s.work[1, i] * y)
@@ -252,6 +250,8 @@ def _prune(s: Any) -> None:
                 _copy(s, h, kept)
             kept += 1
     s.hyp = max(kept, 1)
+    if s.hyp < HYPOTHESES:
+        s.ringed = 0
     total = 0.0
     for h in range(s.hyp):
         total += s.hw[h]

@@ -263,7 +263,7 @@ def _use_fix(s: Any, t_ns: int) -> None:
     s.far_fixes = s.far_fixes + 1 if s.outliers - before > 0.9 else 0
     if s.far_fixes >= 10:  # ten in a row: it is the track that is wrong
         s.far_fixes, s.relocated = 0, s.relocated + 1
-        s.hyp = mixture.HYPOTHESES
+        s.hyp, s.ringed = mixture.HYPOTHESES, 1
         for h in range(s.hyp):
             for i in range(mixture.N):
                 s.hx[h, i] = 0.0
@@ -272,6 +272,7 @@ def _use_fix(s: Any, t_ns: int) -> None:
             s.hx[h, 2] = attitude.wrap(2.0 * math.pi * h / s.hyp)
             s.hP[h, 2, 2], s.hP[h, 3, 3] = (math.pi / s.hyp) ** 2, 0.01
             s.hP[h, 6, 6] = 1e-5
+            s.hP[h, 4, 4] = s.hP[h, 5, 5] = 1.0
             s.hw[h] = 1.0 / s.hyp
         s.located = 0
         mixture.fix(s, t_ns, e, n, sd)

@@ -302,8 +302,12 @@ def _streams(
     oriented = _orientation(tables, acc[1] if acc is not None else None, platform, report)
     if oriented is not None:
         north, frame = oriented
-        columns: dict[str, SourceColumn] = {q: SourceColumn(q, 1.0) for q in QUAT}
-        part = StreamChannel("/phone/orientation", QUATERNION, columns, metadata={"north": north})
+        part = StreamChannel(
+            "/phone/orientation",
+            QUATERNION,
+            {q: SourceColumn(q, 1.0) for q in QUAT},
+            metadata={"north": north},
+        )
         yield Stream([part], report, subject="Orientation"), frame
 
 
@@ -329,6 +333,8 @@ def _orientation(
 
     to_east = Rotation.from_euler("z", 90, degrees=True)
     force, field = _beside(acc, table), _beside(tables.get("Magnetometer"), table)
+    if force is None:
+        return None
     best: tuple[tuple[float, float], Any] | None = None
     ios = platform == "ios"
     for inverse, north in ((False, ios), (True, ios), (False, not ios), (True, not ios)):

@@ -31,7 +31,8 @@ def write_phone(
 
     Files: ``phone-<name>.txt``, or a folder ``phone-<name>`` as the app exports it; ``….truth.csv`` (the walker's
     place on the ground in east, true north, up; the phone's attitude; ``still`` while nobody walks),
-    ``….truth.steps.csv`` (a row a step), ``….truth.fix.csv`` (the same place on the Earth) and ``….truth.toml``.
+    ``….truth.steps.csv`` (a row a step), ``….truth.fix.csv`` (the same place on the Earth), ``….truth.marks.csv``
+    (tier ``placement``: where the phone is carried; tier ``activity``: walking or standing) and ``….truth.toml``.
 
     Raises
     ------
@@ -47,7 +48,8 @@ def write_phone(
     walk = phone_walk(scenario, seed=seed, **options)
     stem = name or f"{scenario}-{seed:03d}"
     log = folder / (f"{stem}.txt" if format == "android-text" else stem)
-    truths = [folder / f"{stem}.truth{part}" for part in (".csv", ".steps.csv", ".fix.csv", ".toml")]
+    kinds = (".csv", ".steps.csv", ".fix.csv", ".marks.csv", ".toml")
+    truths = [folder / f"{stem}.truth{part}" for part in kinds]
     with written_together(folder, (log, *truths), overwrite=overwrite) as part:
         _WRITERS[format](part / log.name, walk)
         origin = 0 if format != "phyphox" else int(walk.t_ns[0])
@@ -55,7 +57,8 @@ def write_phone(
         steps = walk.steps.with_columns(pl.col("start_ns") - origin, pl.col("end_ns") - origin)
         steps.write_csv(part / truths[1].name)
         _truth_places(walk, origin).write_csv(part / truths[2].name)
-        (part / truths[3].name).write_bytes(msgspec.toml.encode(_facts(walk, format)))
+        _truth_marks(walk, origin).write_csv(part / truths[3].name)
+        (part / truths[4].name).write_bytes(msgspec.toml.encode(_facts(walk, format)))
     return [log], truths, walk
 
 
@@ -154,6 +157,25 @@ def _truth_places(walk: PhoneWalk, origin: int) -> pl.DataFrame:
     lat, lon = geodetic(walk.options, place)
     alt = walk.options.alt_m + place[:, 2]
     return pl.DataFrame({"t_ns": walk.t_ns[::every] - origin, "lat_deg": lat, "lon_deg": lon, "alt_m": alt})
+
+
+def _truth_marks(walk: PhoneWalk, origin: int) -> pl.DataFrame:
+    """Return annotations: the placement, and stretches of walking and standing."""
+    t = walk.t_ns - origin
+    change = np.flatnonzero(np.diff(walk.walking)) + 1
+    starts, ends = np.concatenate(([0], change)), np.concatenate((change - 1, [len(t) - 1]))
+    return pl.DataFrame(
+        {
+            "tier": ["placement", *["activity"] * len(starts)],
+            "start_ns": [t[0], *t[starts]],
+            "end_ns": [t[-1], *t[ends]],
+            "label": [
+                walk.options.placement,
+                *("walking" if walk.walking[k] else "standing" for k in starts),
+            ],
+        },
+        schema_overrides={"start_ns": pl.Int64, "end_ns": pl.Int64},
+    )
 
 
 def _facts(walk: PhoneWalk, format: str) -> dict[str, Any]:
