@@ -29,10 +29,10 @@ class Withheld(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 def stretches(withhold: Sequence[Withheld], rec: Recording) -> dict[str, list[tuple[int, int]]]:
     """Return the stretches by topic, as log time (ns), half open."""
-    found: dict[str, list[tuple[int, int]]] = {}
+    spans: dict[str, list[tuple[int, int]]] = {}
     for one in withhold:
         start = (rec.start_ns or 0) + round(one.start_s * 1e9)
         for topic in rec.channels:
             if fnmatchcase(topic, one.topic):
-                found.setdefault(topic, []).append((start, start + round(one.length_s * 1e9)))
-    return found
+                spans.setdefault(topic, []).append((start, start + round(one.length_s * 1e9)))
+    return spans

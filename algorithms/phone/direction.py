@@ -35,7 +35,7 @@ FIELDS: list[tuple[Any, ...]] = [
     ("pushed", "f8"),  # variance of that push
     ("fore_r", "f8"),  # correlation of the force along the offset with the push
     ("offset", "f8"),
-    ("found", "i8"),  # whether the walking direction is the device's heading and the offset, or that heading
+    ("offset_used", "i8"),  # whether the offset is added to the device's heading
     ("opposite", "f8"),  # probability that fore is taken for aft
     ("offset_sd", "f8"),  # standard deviation of the offset otherwise (rad)
     ("elongation", "f8"),
@@ -188,7 +188,7 @@ def heading_of(s: Any, start_ns: int, end_ns: int) -> float:
         w += math.sin(yaw)
     heading = math.atan2(w, c)
     _choose(s)
-    return attitude.wrap(heading + s.offset if s.found == 1 else heading)
+    return attitude.wrap(heading + s.offset if s.offset_used == 1 else heading)
 
 
 @compiled
@@ -197,21 +197,21 @@ def _choose(s: Any) -> None:
     aside = 0.5 * abs(attitude.wrap(2.0 * s.offset))  # of the axis, whichever end is fore
     backwards = abs(s.offset) > 0.5 * math.pi
     if s.mode == WALKING:
-        s.found = 1
+        s.offset_used = 1
     elif s.mode != AUTO:
-        s.found = 0
+        s.offset_used = 0
     elif s.level_up < SCREEN_UP:
-        s.found = 1
+        s.offset_used = 1
     elif s.offset_n >= ENOUGH and s.elongation > CLEAR:
         if aside > ASIDE or (backwards and s.fore_r > REVERSED_R):
-            s.found = 1
+            s.offset_used = 1
         elif aside < ALIGNED:
-            s.found = 0
+            s.offset_used = 0
     s.opposite, s.offset_sd = 0.0, 0.0
     other = math.exp(-2.0 * SIGN_KAPPA * s.fore_r)  # odds that the end taken for fore is aft
-    if s.found == 0 and backwards and s.mode == AUTO:
+    if s.offset_used == 0 and backwards and s.mode == AUTO:
         s.opposite = NOT_HELD / (NOT_HELD + other)
-    if s.found == 1:
+    if s.offset_used == 1:
         s.opposite = other / (1.0 + other)
         s.offset_sd = 0.5 * math.sqrt(-2.0 * math.log(min(max(s.elongation, 0.02), 1.0)))
 

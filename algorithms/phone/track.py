@@ -153,7 +153,7 @@ def _doubt(s: Any) -> None:
         s.offset_var += change
         for h in range(s.hyp):
             s.hP[h, 2, 2] += change
-    offset = s.offset if s.found == 1 else 0.0
+    offset = s.offset if s.offset_used == 1 else 0.0
     jump = attitude.wrap(offset - s.offset_now)
     turned = s.steps > 0 and abs(jump) > 0.35 * math.pi
     s.offset_now = offset
@@ -228,7 +228,7 @@ def _close_step(s: Any, cause: int, out_message: Any, out_t_ns: Any, out: Any, k
     out[k, O_HEADING + 1] = s.heading
     out[k, O_HEADING + 2] = s.ring[last, ring.MAG_YAW] if s.mag_n > 0 else np.nan
     out[k, O_HEADING + 3] = s.ring[last, ring.DISTURBED]
-    out[k, O_HEADING + 4], out[k, O_HEADING + 5] = s.offset, s.found
+    out[k, O_HEADING + 4], out[k, O_HEADING + 5] = s.offset, s.offset_used
     out[k, O_HEADING + 6] = s.opposite
     for j in range(ring.N_FEATURES):
         out[k, O_DETECTOR + j] = s.features[j]

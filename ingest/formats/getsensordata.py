@@ -140,22 +140,19 @@ def _declared(head: bytes) -> dict[str, tuple[str, ...]]:
 
     A kind that is declared twice (beacons of two makes) has its first columns in common.
     """
-    found: dict[str, tuple[str, ...]] = {}
+    columns_of: dict[str, tuple[str, ...]] = {}
     comments = [c for c in head.decode("utf-8", "replace").splitlines() if c.startswith("%")]
     for kind, text in (m.groups() for c in comments if (m := _DECLARED.search(c))):
-        if kind not in KINDS or kind in found:
+        if kind not in KINDS or kind in columns_of:
             continue
-        names = [
-            kind,
-            *(n for n in text.split(";") if n.strip()),
-        ]  # "Mag_X(uT);;Mag_Y(uT)": a slip of the app
-        columns = ["", *(_column(n) for n in names[1:])]
+        # An empty name is a slip of the app: "Mag_X(uT);;Mag_Y(uT)" has no column there.
+        columns = ["", *(_column(n) for n in text.split(";") if n.strip())]
         if kind not in ("WIFI", "BLE4", "BLUE", "GNSS") and "accuracy" in columns:
             columns[columns.index("accuracy")] = ""
         if all(n in columns for n in KINDS[kind] if n and n not in ("t", "alt", "accuracy")):
             last = max(i for i, n in enumerate(columns) if n)
-            found[kind] = tuple(columns[: last + 1])
-    return found
+            columns_of[kind] = tuple(columns[: last + 1])
+    return columns_of
 
 
 def _column(name: str) -> str:

@@ -159,15 +159,15 @@ def _rotation(frame: pl.DataFrame) -> dict[str, np.ndarray]:
 
 def _sensor_column(name: str) -> str:
     low = name.lower()
-    known = {
+    roles = {
         "utctimemillis": "t",
         "elapsedrealtimenanos": "boot",
         "yawdeg": "x",
         "rolldeg": "y",
         "pitchdeg": "z",
     }
-    if low in known:
-        return known[low]
+    if low in roles:
+        return roles[low]
     bias = low.startswith(("bias", "drift"))
     match = re.search(r"([xyz])(?:mps2|radpersec|microt)$", low)
     return (("bias_" if bias else "") + match[1]) if match else ""
