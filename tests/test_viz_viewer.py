@@ -15,11 +15,14 @@ import marcha.recording as mr
 import marcha.replay as rp
 import marcha.viz as viz
 import numpy as np
+import polars as pl
 import psutil
 import pytest
+from marcha.recording.changes import change
 from marcha.recording.errors import MarchaError
 from marcha.viz import viewer
 from marcha.viz.screenshot import screenshots
+from marcha.viz.text import drawn_only
 
 from .test_viz_rrd import RUN, write_walk
 
@@ -60,6 +63,22 @@ def test_no_view_complains_and_every_tab_has_a_picture(rrd: Path) -> None:
 def test_a_tab_that_is_not_there_is_named(rrd: Path) -> None:
     with pytest.raises(MarchaError, match="no tab 'Map'; it has"):
         screenshots(rrd, ["Map"])
+
+
+@pytest.mark.vulkan
+@needs_vulkan
+def test_labels_of_every_script_have_a_picture(rrd: Path, tmp_path: Path) -> None:
+    """The viewer without a window has one font and ends at what that lacks; pictures have ``?`` there."""
+    done = mr.open(rrd.with_name("done.mcap"))
+    times = [done.start_ns, done.start_ns + 10**9]
+    marks = {"tier": ["歩く", "b"], "label": ["歩行 ä Ω д", "م"], "start_ns": times, "end_ns": times[::-1]}
+    change(done, tmp_path / "a.mcap", add=pl.DataFrame(marks).with_columns(start_ns=pl.lit(times[0])))
+    with pytest.raises(MarchaError, match=r"did not answer.*glyph"):
+        screenshots(viz.write_rrd(mr.open(tmp_path / "a.mcap"), tmp_path / "whole.rrd"))
+    with drawn_only():
+        viz.write_rrd(mr.open(tmp_path / "a.mcap"), tmp_path / "a.rrd")
+    (shot,) = screenshots(tmp_path / "a.rrd")
+    assert shot.reports == ()
 
 
 @pytest.mark.vulkan

@@ -24,7 +24,7 @@ from .figures import WALK, available_figures, figure
 from .floor import floor_plan, loaders_of
 from .page import Html, PagePicture, number
 from .stride_figures import joint_cycles, side_of, strides_by
-from .text import printable
+from .text import drawn_only, printable
 
 MOST_ROWS = 400
 """More rows of annotations or intervals than these are counted; the recording has them all."""
@@ -320,10 +320,12 @@ def _viewer(html: Html, rec: Recording) -> None:
 
     with scratch_folder() as folder:
         try:
-            write_rrd(rec, folder / "view.rrd")
+            with drawn_only():
+                write_rrd(rec, folder / "view.rrd")
             (shot,) = screenshots(folder / "view.rrd", at=1.0)
         except MarchaError as error:
-            html.text(f"No picture of the viewer: {printable(error)}.", "note")
+            reason = printable(error).replace(str(folder / "view.rrd"), rec.path.name)
+            html.text(f"No picture of the viewer: {reason}.", "note")
             return
     html.pictures(
         [PagePicture("viewer", "", "The viewer as `marcha view` opens it, cursor at the end.", shot.png, b"")]

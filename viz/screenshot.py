@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,8 +64,8 @@ def screenshots(
     Raises
     ------
     MarchaError
-        No graphics (Debian: mesa-vulkan-drivers and libvulkan1), the recording did not load, or it has no
-        such tab.
+        No graphics (Debian: mesa-vulkan-drivers and libvulkan1), the recording did not load, it has no such
+        tab, or the viewer did not answer.
     """
     import numpy as np
     from rerun.experimental import ViewerClient
@@ -72,7 +73,7 @@ def screenshots(
     from .timeaxis import SINCE_START
 
     path = Path(rrd).resolve()
-    with viewer.native(headless=True, size=size) as process:
+    with viewer.native(headless=True, size=size) as process, _answering(process, path):
         client = ViewerClient.connect(viewer.uri(process.port))
         client.open(str(path))
         state = loaded(client, path, patience_s)
@@ -91,6 +92,17 @@ def screenshots(
             )
             pictures.append(Screenshot(tab, png, reports))
         return pictures
+
+
+@contextmanager
+def _answering(process: viewer.Viewer, path: Path) -> Iterator[None]:
+    """Raise ``MarchaError`` where the viewer ends, or is too slow to answer."""
+    try:
+        yield
+    except (ConnectionError, RuntimeError) as error:
+        last = process.complaint("panicked")
+        reason = last if "panicked" in last else error
+        raise MarchaError(f"{path}: the viewer did not answer: {reason}") from None
 
 
 def loaded(client: Any, path: Path, patience_s: float) -> Any:

@@ -109,11 +109,16 @@ class Viewer:
                 time.sleep(0.02)
             else:
                 return
+        reason = self.complaint("error")
+        self.close()
+        raise MarchaError(f"the Rerun viewer did not start: {reason}")
+
+    def complaint(self, word: str) -> str:
+        """Return the first line with a word that the process said, else the first line."""
         self._said.seek(0)
         lines = [line for line in self._said.read().decode(errors="replace").splitlines() if line.strip()]
-        self.close()
-        lines = [line for line in lines if "error" in line.lower()] or lines or ["it said nothing"]
-        raise MarchaError(f"the Rerun viewer did not start: {lines[0]}")
+        lines = [line for line in lines if word in line.lower()] or lines or ["it said nothing"]
+        return lines[0]
 
     @property
     def running(self) -> bool:
