@@ -31,6 +31,8 @@ _EPOCH_NS = 946_684_800 * 10**9
 _KINDS = {"acc": "ACCEL", "gyr": "GYRO", "mag": "MAGN", "quat": "ORNT", "pos": "POS", "vel": "VEL"}
 _UNITS = {"m/s²": "m/s^2", "°": "deg", "°C": "oC", "-": "n/a", "": "n/a", "as named": "n/a", "Pa": "Pa"}
 _COUNTED = ("ACCEL", "GYRO", "MAGN", "ORNT", "POS", "VEL", "JNTANG", "LATENCY", "MISC")
+_LABEL_SIGNS = 64
+"""Of a tracking system: its files are named by it, and file systems take 255 bytes."""
 
 
 class BidsOptions(Selection, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -311,7 +313,7 @@ def systems(rec: Recording, topics: list[str], options: Selection) -> list[Syste
     for (device, _), members in groups.items():
         alone = sum(d == device for d, _ in groups) == 1
         name = device if alone else members[0].strip("/")
-        word = re.sub(r"[^0-9A-Za-z]", "", name) or "system"
+        word = re.sub(r"[^0-9A-Za-z]", "", name)[:_LABEL_SIGNS] or "system"
         label, number = word, 1
         while label.lower() in taken:
             number += 1

@@ -62,14 +62,7 @@ def unpack(path: Path, folder: Path, limit_gb: float = UNPACK_LIMIT_GB) -> None:
     limit = limit_gb * 1e9
     try:
         with zipfile.ZipFile(path) as archive:
-            members = archive.infolist()
-            if len(members) > MEMBERS:
-                raise MarchaError(
-                    f"{path}: the archive has {len(members)} members, more than {MEMBERS}; unpack it first"
-                )
-            seen: set[str] = set()
-            for member in members:
-                _check(path, member, seen)
+            members = trusted_members(path, archive)
             total = sum(m.file_size for m in members)
             if total > limit:
                 raise MarchaError(_too_large(path, total, limit_gb))
@@ -93,6 +86,26 @@ def unpack(path: Path, folder: Path, limit_gb: float = UNPACK_LIMIT_GB) -> None:
         raise MarchaError(f"{path}: cannot be unpacked: {error.strerror or error}") from error
 
 
+def trusted_members(path: Path, archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
+    """Return the members of an archive whose names can do no harm.
+
+    Raises
+    ------
+    MarchaError
+        There are too many; a name leads out of the archive, stands twice, is empty or too long; a member is a link
+        or encrypted.
+    """
+    members = archive.infolist()
+    if len(members) > MEMBERS:
+        raise MarchaError(
+            f"{path}: the archive has {len(members)} members, more than {MEMBERS}; unpack it first"
+        )
+    seen: set[str] = set()
+    for member in members:
+        _check(path, member, seen)
+    return members
+
+
 def _too_large(path: Path, size: float, limit_gb: float) -> str:
     return (
         f"{path}: the archive unpacks to {size / 1e9:.1f} GB, more than {limit_gb:g} GB; if you trust it, "
@@ -104,6 +117,8 @@ def _check(path: Path, member: zipfile.ZipInfo, seen: set[str]) -> None:
     name = member.filename.replace("\\", "/")
     parts = PurePosixPath(name).parts
     shown = name if len(name) < 60 else f"{name[:57]}…"
+    if not parts:
+        raise MarchaError(f"{path}: a member has no name; the archive is damaged: pack it again")
     if name.startswith("/") or ".." in parts or (parts and ":" in parts[0]):
         raise MarchaError(
             f"{path}: member {shown!r} leads out of the folder; the archive is not to be trusted"

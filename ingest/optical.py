@@ -88,14 +88,16 @@ def float_rows(
             truncate_ragged_lines=True,
             quote_char=None,
         )[1:]
-        columns = []
-        for k, name in enumerate(names):
-            cell = frame[:, k].str.strip_chars()
-            value = cell.cast(pl.Float64, strict=False)
-            value = pl.select(pl.when(value.is_finite()).then(value)).to_series()
-            odd = cell.is_not_null() & value.is_null() & ~cell.str.to_lowercase().is_in(MISSING)
-            if k and odd.any():
-                first = int(odd.arg_true()[0])
+        frame = frame.select(pl.all().str.strip_chars())
+        values = frame.select(pl.all().cast(pl.Float64, strict=False).fill_null(np.nan)).to_numpy(
+            writable=True
+        )
+        values[~np.isfinite(values)] = np.nan
+        for k in np.flatnonzero(np.isnan(values[:, 1:]).any(axis=0)) + 1:
+            name, cell = names[k], frame[:, int(k)]
+            odd = ~cell.str.to_lowercase().is_in(MISSING).fill_null(True).to_numpy() & np.isnan(values[:, k])
+            if odd.any():
+                first = int(np.argmax(odd))
                 report.repair(
                     "missing_cell",
                     f"{name}: {cell[first]!r} is not a number: taken as missing",
@@ -103,8 +105,6 @@ def float_rows(
                     line=int(line[good[first]]),
                     subject=f"{name} unreadable",
                 )
-            columns.append(value.fill_null(np.nan).to_numpy())
-        values = np.column_stack(columns)
         without = np.isnan(values[:, 0])
         bad[good[without]] = True
         values, good = values[~without], good[~without]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -133,8 +133,15 @@ def make_options(importer: Importer, values: Mapping[str, Any]) -> CommonOptions
     return options_of(importer.Options, values, f"format {importer.name}")
 
 
-def recognise(path: Path) -> list[Candidate]:
+def recognise(path: Path, among: Collection[str] | None = None) -> list[Candidate]:
     """Return the formats that a file or folder may be, surest first; a folder as a whole, not what is in it.
+
+    Parameters
+    ----------
+    path : Path
+        Looked at, not read.
+    among : collection of str, optional
+        Only these formats look at it.
 
     Raises
     ------
@@ -144,6 +151,8 @@ def recognise(path: Path) -> list[Candidate]:
     head = _head(path)
     candidates = []
     for name, (importer, _) in importers().items():
+        if among is not None and name not in among:
+            continue
         try:
             confidence = float(importer.sniff(head, path))
         except Exception as error:  # a plug-in's fault must not stop the others
@@ -305,9 +314,9 @@ def _resolve(
 
 def _candidates(path: Path, wanted: Registered | None) -> list[Candidate]:
     """Return the formats that fit; of several only a clear leader."""
-    candidates = recognise(path)
     if wanted is not None:
-        return [c for c in candidates if c.name == wanted.importer.name]
+        return recognise(path, [wanted.importer.name])
+    candidates = recognise(path)
     if len(candidates) > 1 and candidates[0].confidence - candidates[1].confidence < LEAD:
         listed = ", ".join(f"{c.name} ({c.confidence:.2f})" for c in candidates)
         raise MarchaError(f"{path}: could be {listed}; say which with --format")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, TypeVar
 
 import msgspec
@@ -35,9 +36,7 @@ def options_of(
     UsageError
         An option is unknown, or its value does not fit; the line names option, value and rule.
     """
-    about = msgspec.inspect.type_info(kind)
-    assert isinstance(about, msgspec.inspect.StructType)
-    kinds = {field.name: _plain(field.type) for field in about.fields}
+    kinds = _kinds(kind)
     result: dict[str, Any] = {}
     for name, value in values.items():
         if name not in kinds:
@@ -58,6 +57,14 @@ def options_of(
             raise UsageError(f"{where}: {reason}") from None
         value = values.get(name.split("[")[0], "")
         raise UsageError(f"{where}: option {prefix}{name}={value!r}: {reason}") from None
+
+
+@cache
+def _kinds(kind: type[msgspec.Struct]) -> dict[str, msgspec.inspect.Type]:
+    """Return the type of each option; to look it up in the annotations takes longer than all the rest."""
+    about = msgspec.inspect.type_info(kind)
+    assert isinstance(about, msgspec.inspect.StructType)
+    return {field.name: _plain(field.type) for field in about.fields}
 
 
 def _plain(kind: msgspec.inspect.Type) -> msgspec.inspect.Type:

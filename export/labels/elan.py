@@ -141,6 +141,8 @@ def read(path: Path, data: bytes) -> list[Label]:
         root = ElementTree.fromstring(data)
     except ElementTree.ParseError as error:
         raise MarchaError(f"{path}: line {error.position[0]}: is not XML: {error}") from None
+    except (LookupError, ValueError) as error:  # an encoding that is unknown, or of several bytes
+        raise MarchaError(f"{path}: is not XML: {error}; save it in UTF-8") from None
     if root.tag != "ANNOTATION_DOCUMENT":
         raise MarchaError(f"{path}: is XML of {root.tag[:60]!r}, not of ELAN; save it as .eaf")
     header = root.find("HEADER")

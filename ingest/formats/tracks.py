@@ -89,7 +89,7 @@ def _blocks(
         track: list[Point] = list(points(path))
     except OSError as error:
         raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (ElementTree.ParseError, ValueError) as error:
+    except (ElementTree.ParseError, LookupError, ValueError) as error:  # the last two: its encoding
         raise MarchaError(f"{path}: is no whole XML of a track: {error}") from None
     if not track:
         raise MarchaError(f"{path}: no point of a track; routes and waypoints are no recording")
@@ -101,7 +101,9 @@ def _blocks(
     for k, (text, lat, lon, alt) in enumerate(track, 1):
         stamp = _instant(text)
         if stamp is None:
-            report.drop("bad_row", f"point {k}: {text!r} is no time; left out", line=k)
+            report.drop("bad_row", f"point {k}: {text[:40]!r} is no time; left out", line=k)
+        elif not np.isfinite([lat, lon]).all():
+            report.drop("bad_row", f"point {k}: has no latitude and longitude; left out", line=k)
         else:
             rows.append((stamp, k, lat, lon, alt))
     if rows:
@@ -131,9 +133,8 @@ def _gpx_points(path: Path) -> Iterator[Point]:
         inside = {_local(c.tag): (c.text or "").strip() for c in element}
         yield (
             inside.get("time", ""),
-            float(element.get("lat", "nan")),
-            float(element.get("lon", "nan")),
-            float(inside.get("ele") or np.nan),
+            *(_number(element.get(name, "")) for name in ("lat", "lon")),
+            _number(inside.get("ele", "")),
         )
         element.clear()
 
@@ -144,7 +145,12 @@ def _kml_points(path: Path) -> Iterator[Point]:
         if kind == "Track":
             when = [(c.text or "").strip() for c in element if _local(c.tag) == "when"]
             where = [(c.text or "").split() for c in element if _local(c.tag) == "coord"]
-            for text, numbers in zip(when, where, strict=False):
+            if len(when) != len(where):
+                raise MarchaError(
+                    f"{path}: a track of {len(when)} times and {len(where)} places; which belong together cannot be "
+                    "known: export it again"
+                )
+            for text, numbers in zip(when, where, strict=True):
                 yield _kml_point(text, numbers)
         elif kind == "Placemark":
             children = {_local(c.tag): c for c in element.iter()}
@@ -157,5 +163,13 @@ def _kml_points(path: Path) -> Iterator[Point]:
 
 
 def _kml_point(text: str, numbers: Sequence[str]) -> Point:
-    values = [float(n) for n in numbers]
-    return text, values[1], values[0], values[2] if len(values) > 2 else np.nan
+    lon, lat, alt = (*map(_number, numbers[:3]), np.nan, np.nan, np.nan)[:3]
+    return text, lat, lon, alt
+
+
+def _number(text: str) -> float:
+    """Return a number of ASCII digits; NaN where it is none, so that only its point is left out."""
+    try:
+        return float(text) if text.isascii() and "_" not in text else np.nan
+    except ValueError:
+        return np.nan

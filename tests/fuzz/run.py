@@ -9,7 +9,7 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -27,8 +27,12 @@ if TYPE_CHECKING:
 WARM = 4
 """Most inputs of each target that run before all others, so that what they need is loaded once."""
 
-TOGETHER = 16
+TOGETHER = 64
 """Inputs of one target that run in one process."""
+FEW = 1000
+"""Inputs up to which all targets have as many: a run of so few is the same on every machine."""
+MOST_TURNS = 12
+"""Of a cheap target while a costly one has one: each gets about the same processor time."""
 
 
 @dataclass
@@ -97,26 +101,47 @@ def generator(seed: int, target: str, number: int) -> Rng:
     return np.random.default_rng([seed, *target.encode(), number])
 
 
-def prepare(place: Path, warm_inputs: int = WARM) -> Seeds:
-    """Make the sound inputs in a process of its own, and load here what that process had loaded."""
+def prepare(place: Path, warm_inputs: int = WARM) -> tuple[Seeds, dict[str, float]]:
+    """Make the sound inputs in a process of its own, and load here what that process had loaded.
+
+    Returns
+    -------
+    Seeds
+        The sound inputs.
+    dict of str to float
+        Processor time (s) that an input of each target takes.
+    """
 
     def warm() -> object:
         from . import seeds, targets
 
         sound = seeds.make(place / "seeds")
+        with emptied(place) as folder:
+            targets.warm(sound, folder)
+        taken = {}
         for target in {t.name: t for t in targets.targets(sound)}.values():
-            for number in range(warm_inputs):
+            for number in range(warm_inputs + 1):
+                if number == 1:  # the first one loads what it needs
+                    began = time.process_time()
                 with emptied(place) as folder, contextlib.suppress(BaseException):
                     target.run(generator(0, target.name, number), folder)
-        return sound, *loaded()
+            taken[target.name] = max(1e-4, (time.process_time() - began) / warm_inputs)
+        return (sound, taken), *loaded()
 
     result, verdict = in_child(warm, cpu_s=600, memory=4 << 30)
     if result is None or verdict.kind:
         raise RuntimeError(f"the sound inputs cannot be made: {verdict.kind} {verdict.detail}")
-    sound, modules, kernels = result
+    made, modules, kernels = result
     shutil.rmtree(place / "seeds", ignore_errors=True)
     load(modules, kernels)
-    return sound
+    return made
+
+
+def in_turn(known: Sequence[Target], taken: Mapping[str, float]) -> list[Target]:
+    """Return the targets in the order of their inputs: all once, then the cheaper ones again and again."""
+    long = float(np.quantile([taken[t.name] for t in known], 0.9))
+    turns = [min(MOST_TURNS, max(1, round(long / taken[t.name]))) for t in known]
+    return [t for k in range(max(turns)) for t, n in zip(known, turns, strict=True) if k < n]
 
 
 def run(
@@ -151,12 +176,15 @@ def run(
     began = time.monotonic()
     place = scratch()
     try:
-        sound = prepare(place, min(WARM, 1 + inputs // 1000))
+        sound, taken = prepare(place, min(WARM, 1 + inputs // 1000))
+        chosen = _chosen(sound, only)
+        if inputs > FEW:
+            chosen = in_turn(chosen, taken)
         result = Result()
         if jobs == 1:
-            result = _share(sound, place, range(first, first + inputs), seed, only, keep, log)
+            result = _share(chosen, place, range(first, first + inputs), seed, keep, log)
         else:
-            for part in _shared(sound, place, inputs, seed, jobs, only, first, keep, log):
+            for part in _shared(chosen, place, inputs, seed, jobs, first, keep, log):
                 result.merge(part)
     finally:
         shutil.rmtree(place, ignore_errors=True)
@@ -165,12 +193,11 @@ def run(
 
 
 def _shared(
-    sound: Seeds,
+    chosen: Sequence[Target],
     place: Path,
     inputs: int,
     seed: int,
     jobs: int,
-    only: str,
     first: int,
     keep: Path | None,
     log: Path | None,
@@ -185,7 +212,7 @@ def _shared(
             os.close(reader)
             own = place / f"job{job}"
             own.mkdir()
-            part = _share(sound, own, range(first + job, first + inputs, jobs), seed, only, keep, log)
+            part = _share(chosen, own, range(first + job, first + inputs, jobs), seed, keep, log)
             with os.fdopen(writer, "wb") as out:
                 pickle.dump(part, out)
             os._exit(0)
@@ -200,21 +227,25 @@ def _shared(
     return parts
 
 
-def _share(
-    sound: Seeds,
-    place: Path,
-    numbers: Sequence[int],
-    seed: int,
-    only: str,
-    keep: Path | None,
-    log: Path | None,
-) -> Result:
+def _chosen(sound: Seeds, only: str) -> list[Target]:
+    """Return the targets whose name has ``only``; the one that has it as its name before others."""
     from .targets import targets
 
     known = targets(sound)
     chosen = [t for t in known if only == t.name] or [t for t in known if only in t.name]
     if not chosen:
         raise SystemExit(f"no target has {only!r} in its name")
+    return chosen
+
+
+def _share(
+    chosen: Sequence[Target],
+    place: Path,
+    numbers: Sequence[int],
+    seed: int,
+    keep: Path | None,
+    log: Path | None,
+) -> Result:
     result, began = Result(), sum(os.times()[:4])
     run_all(result, chosen, numbers, place, seed=seed, keep=keep, log=log)
     result.cpu_s = sum(os.times()[:4]) - began

@@ -11,6 +11,7 @@ import importlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from importlib import resources
+from itertools import product
 from pathlib import Path
 
 import marcha.recording as mr
@@ -24,8 +25,10 @@ from ..contracts.exporter import example
 from ..contracts.importer import ImporterContract
 
 TESTS = Path(__file__).resolve().parents[1]
-ROWS = (120, 400)
+ROWS = (64, 120, 400)
 """Lines of a sample, more where the format needs more: what reads them right reads more of them right."""
+BINARY_BYTES = (4096, 16384, 1 << 30)
+"""Bytes of a sample that is not text, more where the format needs more."""
 Rows = dict[str, NDArray[np.uint64]]
 """Topic to the hashes of its rows, sorted."""
 
@@ -114,16 +117,22 @@ def sample(contract: type[ImporterContract], folder: Path) -> Sample:
         p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()
     }
     main = path.relative_to(folder).as_posix()
-    whole = Sample(test.importer.name, contract.__name__, files, main, options)
-    for rows in ROWS:
+    whole = converted(Sample(test.importer.name, contract.__name__, files, main, options), folder / "whole")
+    for rows, size in product(ROWS, BINARY_BYTES):
         short = {
-            k: v if b"\x00" in v or k.endswith(".toml") else b"".join(v.splitlines(keepends=True)[:rows])
+            k: v[:size]
+            if b"\x00" in v
+            else v
+            if k.endswith(".toml")
+            else b"".join(v.splitlines(keepends=True)[:rows])
             for k, v in files.items()
         }
         # Too few where a file is of few long lines, or ends with what makes it whole.
         with contextlib.suppress(mr.MarchaError):
-            return converted(replace(whole, files=short), folder / f"short{rows}")
-    return converted(whole, folder / "whole")
+            found = converted(replace(whole, files=short), folder / f"short{rows}-{size}")
+            if found.rows.keys() == whole.rows.keys():
+                return found
+    return whole
 
 
 def converted(sample: Sample, folder: Path) -> Sample:
@@ -150,9 +159,9 @@ def recordings(folder: Path) -> dict[str, bytes]:
     from marcha.replay import replay
 
     folder.mkdir(parents=True)
-    found = {"example": example(folder / "example.mcap", 300).read_bytes()}
+    found = {"example": example(folder / "example.mcap", 64).read_bytes()}
     log = simulate("straight", folder, seed=3, length_m=2).paths[0]
-    log.write_bytes(b"".join(log.read_bytes().splitlines(keepends=True)[: ROWS[-1]]))
+    log.write_bytes(b"".join(log.read_bytes().splitlines(keepends=True)[: ROWS[1]]))
     ingest.convert(log, folder / "walk.mcap")
     with mr.open(folder / "walk.mcap") as rec:
         replay(rec, ["foot.naive"], out=folder / "done.mcap")

@@ -7,7 +7,6 @@ import io
 import json
 import os
 import warnings
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +20,7 @@ from marcha.cli import main
 from marcha.recording import Finding, MarchaError
 from marcha.recording.check import check
 
-from . import mcap, mutators, seeds
+from . import mcap, mutators, seeds, structures
 from .mutators import Mutated, Rng, pick
 from .seeds import Rows, Sample, Seeds
 from .server import Failure
@@ -30,26 +29,12 @@ MOST_CHARACTERS = 1200
 """Of a message."""
 WHOLE = "/reference/optical/"
 """Channels whose every row depends on all frames of a capture (clusters of markers)."""
+ZIPPED = 0.05
+"""Share of logs that come in an archive."""
+BY_COMMAND = 0.04
+"""Share of inputs that go through a whole command, which takes longer to read its line than a small file."""
 _CODES = (0, 1, 2, 3, 4)
 _WROTE = (0, 3, 4)
-_TEXT = {
-    ".csv",
-    ".txt",
-    ".tsv",
-    ".gpx",
-    ".kml",
-    ".pos",
-    ".trc",
-    ".mbd",
-    ".json",
-    ".dev",
-    ".log",
-    ".sto",
-    ".mot",
-    ".eaf",
-    ".textgrid",
-    "",
-}
 
 
 @dataclass(frozen=True)
@@ -161,11 +146,11 @@ def importing(sample: Sample) -> Target:
             files.pop(name)
         seeds.put(files, folder)
         path, out = folder / sample.main, folder / "out.mcap"
-        if rng.random() < 0.03:
+        if rng.random() < ZIPPED:
             path, done = _archive(rng, files, folder), Mutated(b"", None)
         options = {k: v.replace("{folder}", str(folder)) for k, v in sample.options.items()}
         named = sample.format if options or rng.random() < 0.8 else None
-        if rng.random() < 0.1:
+        if rng.random() < BY_COMMAND:
             given: list[object] = [x for k, v in options.items() for x in ("--set", f"{k}={v}")]
             given += ["--format", named] if named else []
             code, text = command(folder, ["convert", path, "-o", out, "--json", *given], out)
@@ -199,28 +184,19 @@ def _chosen(rng: Rng, sample: Sample) -> str:
 
 
 def _damage(rng: Rng, name: str, data: bytes) -> Mutated:
-    kind = Path(name).suffix.lower()
-    if kind == ".toml":
+    if Path(name).suffix.lower() == ".toml":
         return mutators.toml(rng, data)
-    if kind in _TEXT and b"\x00" not in data[:1000]:
-        return mutators.text(rng, data)
-    return mutators.blind(rng, data)
+    return structures.inside(rng, name, data)
 
 
 def _archive(rng: Rng, files: dict[str, bytes], folder: Path) -> Path:
     """Pack the files as a stranger would, and damage the archive."""
     path = folder / "in.zip"
-    packing = int(pick(rng, (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)))
-    with zipfile.ZipFile(path, "w", packing) as archive:
-        for name, data in files.items():
-            archive.writestr(name, data)
-        if rng.random() < 0.3:
-            archive.writestr(
-                str(pick(rng, ("../x", "/x", "x" * 300, "a/" * 40 + "b", "C:x", "é\x1b", "con", "in.csv"))),
-                b"1,2\n",
-            )
-    if rng.random() < 0.7:
-        path.write_bytes(mutators.blind(rng, path.read_bytes()).data)
+    members = list(files.items())
+    if rng.random() < 0.3:
+        members.append((str(pick(rng, structures.NAMES)), b"1,2\n"))
+    whole = structures.archived(members, int(pick(rng, structures.PACKINGS)))
+    path.write_bytes(structures.zipped(rng, whole).data if rng.random() < 0.7 else whole)
     return path
 
 
@@ -244,7 +220,7 @@ def reading(data: dict[str, bytes], sound: dict[str, Rows]) -> Target:
             lost = sum(map(len, sound[name].values())) - sum(map(len, found.values()))
             if lost and not said:
                 raise Failure("silent loss", f"{lost} rows are lost ({done.what}), and check finds nothing")
-        if rng.random() < 0.3:
+        if rng.random() < BY_COMMAND:
             _use(rng, folder, path)
 
     return Target("read mcap", run)
@@ -274,8 +250,18 @@ def using(data: dict[str, bytes], to: str) -> Target:
 def _use(rng: Rng, folder: Path, path: Path) -> None:
     from marcha.export import available
 
+    ways = _ways(folder, path)
+    at = int(rng.integers(len(ways) + 4))
+    if at < len(ways):
+        command(folder, *ways[at])
+    else:
+        _export(rng, folder, path, str(pick(rng, sorted(available()))))
+
+
+def _ways(folder: Path, path: Path) -> list[tuple[list[object], Path | None]]:
+    """Return commands that users give a recording, and what each writes."""
     out = folder / "used.mcap"
-    ways: list[tuple[list[object], Path | None]] = [
+    return [
         (["info", path], None),
         (["check", path], None),
         (["evaluate", path], None),
@@ -289,19 +275,33 @@ def _use(rng: Rng, folder: Path, path: Path) -> None:
         (["merge", path, path, "--prefix", "/a", "--prefix", "/b", "-o", out], out),
         (["calibrate", "imu", path], None),
         (["view", path, "--rrd", folder / "used.rrd"], folder / "used.rrd"),
+        (["report", path, "--no-picture", "-o", folder / "used.html"], folder / "used.html"),
     ]
-    at = int(rng.integers(len(ways) + 4))
-    if at < len(ways):
-        command(folder, *ways[at])
-    else:
-        _export(rng, folder, path, str(pick(rng, sorted(available()))))
+
+
+def warm(sound: Seeds, folder: Path) -> None:
+    """Do all that users do with a recording once: what is compiled at first use is no hang of an input."""
+    path = folder / "in.mcap"
+    path.write_bytes(sound.recordings["walk"])
+    for arguments, output in _ways(folder, path):
+        command(folder, [*arguments, "--force"] if output else arguments, output)
 
 
 def _export(rng: Rng, folder: Path, path: Path, to: str) -> None:
     from marcha.export import available
 
     out = folder / f"made{available()[to].suffix}"
+    if rng.random() >= 5 * BY_COMMAND:
+        call(folder, lambda: _exported(path, to, out), out)
+        return
     command(folder, ["export", path, "--to", to, "-o", out], out)
+
+
+def _exported(path: Path, to: str, out: Path) -> list[Path]:
+    from marcha.export import export
+
+    with mr.open(path) as rec:
+        return export(rec, to, out)
 
 
 # -- other files ----------------------------------------------------------------------------------------------
@@ -313,7 +313,7 @@ def importing_labels(files: dict[str, bytes], rec: bytes) -> Target:
     def run(rng: Rng, folder: Path) -> None:
         name = str(pick(rng, sorted(files)))
         given = dict(files) if rng.random() < 0.5 else {name: files[name]}
-        given[name] = mutators.text(rng, files[name]).data
+        given[name] = structures.inside(rng, name, files[name]).data
         seeds.put(given | {"in.mcap": rec}, folder)
         out = folder / "out.mcap"
         command(folder, ["annotate", "import", folder / "in.mcap", folder / name, "-o", out], out)
@@ -350,7 +350,7 @@ def calibrating(rec: bytes) -> Target:
     def run(rng: Rng, folder: Path) -> None:
         path, out = folder / "in.mcap", folder / "out.mcap"
         path.write_bytes(rec)
-        (folder / "c.json").write_bytes(mutators.text(rng, sound).data)
+        (folder / "c.json").write_bytes(structures.inside(rng, "c.json", sound).data)
         command(
             folder, ["replay", path, "-e", "foot.naive", "--calibration", folder / "c.json", "-o", out], out
         )
@@ -362,11 +362,11 @@ def targets(sound: Seeds) -> list[Target]:
     """Return a target for every importer, exporter and reader that is registered."""
     from marcha.export import available
 
-    often = [
+    return [
         *map(importing, sound.samples),
-        *(reading(sound.recordings, sound.rows) for _ in range(5)),
+        *[reading(sound.recordings, sound.rows)] * 8,  # where most structure can be damaged
         importing_labels(sound.labels, sound.recordings["example"]),
         configuring(sound.studies),
+        calibrating(sound.recordings["walk"]),
+        *(using(sound.recordings, name) for name in ("", *sorted(available()))),
     ]
-    seldom = [using(sound.recordings, name) for name in ("", "", *sorted(available()))]  # they take longest
-    return [*often, calibrating(sound.recordings["walk"]), *often, *often, *often, *seldom]

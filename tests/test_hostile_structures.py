@@ -1,0 +1,178 @@
+"""Files with a structure of their own, damaged inside it: each of these was found by the fuzzer."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import marcha.recording as mr
+import numpy as np
+import polars as pl
+import pytest
+from marcha.export import export
+from marcha.export.labels import read_labels
+from marcha.ingest import convert
+from marcha.ingest.workbook import MOST_CELLS, read_workbook
+from marcha.recording import MarchaError
+from marcha.viz.canvas import columns_of
+
+from .contracts.exporter import example
+from .radio_samples import workbook
+
+GPX = """<?xml version="1.0"?><gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{}
+</trkseg></trk></gpx>"""
+KML = """<?xml version="1.0"?><kml xmlns="http://www.opengis.net/kml/2.2"
+xmlns:gx="http://www.google.com/kml/ext/2.2"><Document><Placemark>{}</Placemark></Document></kml>"""
+
+
+def gpx_point(k: int, lat: object = 38.7, lon: object = -9.1) -> str:
+    return f'<trkpt lat="{lat}" lon="{lon}"><time>2024-05-01T10:00:{k:02d}Z</time></trkpt>'
+
+
+def when(k: int) -> str:
+    return f"<when>2024-05-01T10:00:{k:02d}Z</when>"
+
+
+def rewritten(path: Path, change: Callable[[bytes], bytes], part: str = "sheet1") -> Path:
+    """Change a member of an archive, with a checksum that fits."""
+    with zipfile.ZipFile(path) as archive:
+        members = [(m.filename, archive.read(m)) for m in archive.infolist()]
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members:
+            archive.writestr(name, change(content) if part in name else content)
+    return path
+
+
+# -- spreadsheets ------------------------------------------------------------------------------------------
+
+
+def far(cell: str, row: int | None = None) -> Callable[[bytes], bytes]:
+    place = f'<row r="{row}">' if row else "<row>"
+    return lambda sheet: sheet.replace(b"</sheetData>", f"{place}{cell}</row></sheetData>".encode())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        far('<c r="XFD1048576"><v>1</v></c>', 1048576),
+        far('<c t=">" r="AAA100000"><v>1</v></c>', 100_000),
+        far("<c r='zz99999'><v>1</v></c>"),
+        far('<x:c r = "ZZZ99999"/>'),
+        far('<c r="&#88;FD1048576"/>'),
+        far("<c/>" * (MOST_CELLS // 100), 200),
+    ],
+)
+def test_a_cell_far_from_the_table_does_not_take_the_memory_of_all_between(
+    tmp_path: Path, change: Callable[[bytes], bytes]
+) -> None:
+    """The reader holds the whole rectangle: 5 kB ended the process, or took 2.8 GB."""
+    path = rewritten(workbook(tmp_path / "a.xlsx", {"BLE": [["x", "y"], [1.0, 2.0]]}), change)
+    with pytest.raises(MarchaError, match="cells, more than"):
+        read_workbook(path)
+
+
+def test_a_sheet_that_unpacks_to_much_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    path = rewritten(
+        workbook(tmp_path / "a.xlsx", {"BLE": [["x", "y"], [1.0, 2.0]]}),
+        lambda sheet: sheet.replace(b"</sheetData>", b" " * 110_000_000 + b"</sheetData>"),
+    )
+    assert path.stat().st_size < 200_000
+    with pytest.raises(MarchaError, match="unpacks to 110 MB"):
+        read_workbook(path)
+
+
+@pytest.mark.parametrize("rows", [1, 3000])
+def test_a_sheet_of_any_usual_size_is_read(tmp_path: Path, rows: int) -> None:
+    path = workbook(tmp_path / "a.xlsx", {"BLE": [["x", "y"], *([float(k), 2.0] for k in range(rows))]})
+    assert read_workbook(path)["BLE"].height == rows
+
+
+def test_a_member_without_a_name_is_refused(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr("x", b"1,2\n")
+    data = (tmp_path / "a.zip").read_bytes()
+    local = data.index(b"PK\x03\x04") + 26
+    nameless = bytearray(data.replace(b"x1,2\n", b"1,2\n"))
+    nameless[local : local + 2] = b"\x00\x00"
+    central = nameless.index(b"PK\x01\x02")
+    nameless[central + 28 : central + 30] = b"\x00\x00"
+    del nameless[central + 46]
+    end = nameless.index(b"PK\x05\x06")
+    nameless[end + 12 : end + 20] = (end - central).to_bytes(4, "little") + central.to_bytes(4, "little")
+    (tmp_path / "a.zip").write_bytes(bytes(nameless))
+    with pytest.raises(MarchaError, match="has no name"):
+        convert(tmp_path / "a.zip", tmp_path / "out.mcap")
+    assert not (tmp_path / "out.mcap").exists()
+
+
+# -- tracks ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("encoding", ["x", "punycode", "utf-7", "cp932"])
+@pytest.mark.parametrize("name", ["walk.gpx", "labels.eaf"])
+def test_an_encoding_that_xml_does_not_have_is_one_line(tmp_path: Path, name: str, encoding: str) -> None:
+    head = f'<?xml version="1.0" encoding="{encoding}"?>'
+    path = tmp_path / name
+    if name == "walk.gpx":
+        path.write_text(head + GPX.format(gpx_point(1)).partition("?>")[2])
+        with pytest.raises(MarchaError, match="is no whole XML"):
+            convert(path, tmp_path / "out.mcap", format="gpx")
+    else:
+        path.write_text(head + "<ANNOTATION_DOCUMENT/>")
+        with pytest.raises(MarchaError, match="is not XML"), mr.open(example(tmp_path / "a.mcap", 50)) as rec:
+            read_labels(path, rec)
+
+
+@pytest.mark.parametrize("lat", ["", "x", "nan", "inf", "3_8", "٣"])
+def test_a_point_without_a_place_is_left_out_and_counted(tmp_path: Path, lat: str) -> None:
+    points = "".join(gpx_point(k, lat if k == 5 else 38.7 + k * 1e-5) for k in range(10))
+    (tmp_path / "walk.gpx").write_text(GPX.format(points), encoding="utf-8")
+    done = convert(tmp_path / "walk.gpx", tmp_path / "out.mcap")
+    assert (done.report.rows_read, done.report.rows_dropped) == (10, 1)
+    with mr.open(tmp_path / "out.mcap") as rec:
+        table = rec.table("/phone/gnss")
+    np.testing.assert_allclose(table["lat_deg"], [38.7 + k * 1e-5 for k in range(10) if k != 5], rtol=1e-12)
+    assert np.all(np.diff(table["t_ns"].to_numpy()) == [1e9] * 4 + [2e9] + [1e9] * 3)
+
+
+@pytest.mark.parametrize("place", ["", "-9.1", "x y z"])
+def test_a_place_of_too_few_numbers_is_left_out(tmp_path: Path, place: str) -> None:
+    coords = "".join(
+        f"<gx:coord>{place if k == 5 else f'-9.1 {38.7 + k * 1e-5} 3'}</gx:coord>" for k in range(9)
+    )
+    (tmp_path / "walk.kml").write_text(
+        KML.format(f"<gx:Track>{''.join(map(when, range(9)))}{coords}</gx:Track>")
+    )
+    done = convert(tmp_path / "walk.kml", tmp_path / "out.mcap")
+    assert (done.report.rows_read, done.report.rows_dropped) == (9, 1)
+
+
+def test_a_track_with_a_time_too_few_is_refused_not_shifted(tmp_path: Path) -> None:
+    """Every place behind the one without a time got the time of the next."""
+    coords = "".join(f"<gx:coord>-9.1 {38.7 + k * 1e-5} 3</gx:coord>" for k in range(9))
+    times = "".join(when(k) for k in range(9) if k != 4)
+    (tmp_path / "walk.kml").write_text(KML.format(f"<gx:Track>{times}{coords}</gx:Track>"))
+    with pytest.raises(MarchaError, match="8 times and 9 places"):
+        convert(tmp_path / "walk.kml", tmp_path / "out.mcap")
+
+
+# -- recordings --------------------------------------------------------------------------------------------
+
+
+def test_a_topic_of_hundreds_of_signs_has_a_short_name_in_bids(tmp_path: Path) -> None:
+    table = pl.DataFrame({"t_ns": np.arange(20) * 10**7, **{f"acc_{a}": np.arange(20.0) for a in "xyz"}})
+    with mr.create(tmp_path / "a.mcap") as out:
+        for last in "ab":
+            out.add_table("/" + "x" * 300 + last, "sensor_msgs/msg/Imu", table)
+    with mr.open(tmp_path / "a.mcap") as rec:
+        files = export(rec, "bids", tmp_path / "made")
+    assert len([f for f in files if f.name.endswith("_motion.tsv")]) == 2
+    about = [json.loads(f.read_text()) for f in files if f.name.endswith("_motion.json")]
+    assert len(about) == 2
+
+
+def test_a_declared_value_that_no_message_has_is_drawn_as_missing() -> None:
+    drawn = columns_of(pl.DataFrame({"shoe": [1.0, 2.0]}), ["shoe", "threshold"], [2.0, 1.0])
+    np.testing.assert_array_equal(drawn, [[2.0, np.nan], [4.0, np.nan]])
