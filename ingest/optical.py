@@ -93,8 +93,8 @@ def float_rows(
             writable=True
         )
         values[~np.isfinite(values)] = np.nan
-        for k in np.flatnonzero(np.isnan(values[:, 1:]).any(axis=0)) + 1:
-            name, cell = names[k], frame[:, int(k)]
+        for k in (np.flatnonzero(np.isnan(values[:, 1:]).any(axis=0)) + 1).tolist():
+            name, cell = names[k], frame[:, k]
             odd = ~cell.str.to_lowercase().is_in(MISSING).fill_null(True).to_numpy() & np.isnan(values[:, k])
             if odd.any():
                 first = int(np.argmax(odd))

@@ -133,7 +133,8 @@ def _gpx_points(path: Path) -> Iterator[Point]:
         inside = {_local(c.tag): (c.text or "").strip() for c in element}
         yield (
             inside.get("time", ""),
-            *(_number(element.get(name, "")) for name in ("lat", "lon")),
+            _number(element.get("lat", "")),
+            _number(element.get("lon", "")),
             _number(inside.get("ele", "")),
         )
         element.clear()
@@ -163,8 +164,8 @@ def _kml_points(path: Path) -> Iterator[Point]:
 
 
 def _kml_point(text: str, numbers: Sequence[str]) -> Point:
-    lon, lat, alt = (*map(_number, numbers[:3]), np.nan, np.nan, np.nan)[:3]
-    return text, lat, lon, alt
+    values = [*map(_number, numbers[:3]), np.nan, np.nan, np.nan]
+    return text, values[1], values[0], values[2]
 
 
 def _number(text: str) -> float:

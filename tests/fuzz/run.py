@@ -120,6 +120,7 @@ def prepare(place: Path, warm_inputs: int = WARM) -> tuple[Seeds, dict[str, floa
             targets.warm(sound, folder)
         taken = {}
         for target in {t.name: t for t in targets.targets(sound)}.values():
+            began = 0.0
             for number in range(warm_inputs + 1):
                 if number == 1:  # the first one loads what it needs
                     began = time.process_time()
