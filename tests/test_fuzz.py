@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -17,7 +18,7 @@ from marcha.ingest import registry
 from .conftest import ROOT
 from .fuzz import mcap, mutators, seeds
 from .fuzz.run import Result, generator, report, run_all
-from .fuzz.server import Failure, Verdict, in_child, together
+from .fuzz.server import Failure, Verdict, in_child, scratch, together
 from .fuzz.targets import Target
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="needs processes that fork")
@@ -49,6 +50,20 @@ def test_every_registered_exporter_is_a_target() -> None:
 
     sound = seeds.Seeds([], {"example": b"", "walk": b""}, {}, {}, {})
     assert {f"export {name}" for name in available()} <= {t.name for t in targets(sound)}
+
+
+def test_what_a_killed_fuzzer_left_the_next_one_removes() -> None:
+    pid = os.fork()
+    if pid == 0:
+        with scratch() as folder:
+            (folder / "input").mkdir()
+            os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(pid, 0)
+    with scratch() as folder:
+        left = list(folder.parent.glob(f"marcha-{pid}-*"))
+        assert folder.is_dir()
+    assert left == []
+    assert not folder.exists()
 
 
 def endless() -> None:

@@ -175,8 +175,7 @@ def run(
         File that gets a line for every failure as it is found, and for every thousand inputs.
     """
     began = time.monotonic()
-    place = scratch()
-    try:
+    with scratch() as place:
         sound, taken = prepare(place, min(WARM, 1 + inputs // 1000))
         chosen = _chosen(sound, only)
         if inputs > FEW:
@@ -187,8 +186,6 @@ def run(
         else:
             for part in _shared(chosen, place, inputs, seed, jobs, first, keep, log):
                 result.merge(part)
-    finally:
-        shutil.rmtree(place, ignore_errors=True)
     result.seconds = time.monotonic() - began
     return result
 

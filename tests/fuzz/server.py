@@ -20,11 +20,13 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from marcha.recording.scratch import remove_left
 
 CPU_S = 5
 """Processor time of one input; a hang by the clock is six times that, since other work may hold the machine."""
@@ -58,10 +60,17 @@ class Verdict:
     cpu_s: float = 0.0
 
 
-def scratch() -> Path:
-    """Return a new folder, in memory where the system has such a place: inputs are many and short lived."""
+@contextlib.contextmanager
+def scratch() -> Iterator[Path]:
+    """Give a folder, in memory where the system has such a place; what a killed fuzzer left there is removed."""
     shared = Path("/dev/shm")
-    return Path(tempfile.mkdtemp(prefix="marcha-fuzz-", dir=shared if os.access(shared, os.W_OK) else None))
+    place = shared if os.access(shared, os.W_OK) else Path(tempfile.gettempdir())
+    remove_left(place)
+    folder = Path(tempfile.mkdtemp(prefix=f"marcha-{os.getpid()}-fuzz-", dir=place))
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def in_child(
