@@ -232,15 +232,17 @@ def carried(point: FloatArray, rot: FloatArray, place: FloatArray) -> FloatArray
 
 
 def frame(z: FloatArray, x: FloatArray, *, along_x: bool = False) -> FloatArray:
-    """Return attitudes (n, 3, 3) with z along ``z`` and x in their plane, or x along ``x``; NaN where parallel."""
-    with np.errstate(invalid="ignore", divide="ignore"):
+    """Return attitudes (n, 3, 3) with z along ``z`` and x in their plane, or x along ``x``.
+
+    NaN where they are parallel, or so long that their square is no number.
+    """
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        z, x = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (z, x))
         y = np.cross(z, x)
         size = np.linalg.norm(y, axis=1, keepdims=True)
-        y = np.where(size > 1e-6 * np.linalg.norm(x, axis=1, keepdims=True), y / size, np.nan)
-        if along_x:
-            x = x / np.linalg.norm(x, axis=1, keepdims=True)
-            return np.stack([x, y, np.cross(x, y)], axis=2)
-        z = z / np.linalg.norm(z, axis=1, keepdims=True)
+        y = np.where(size > 1e-6, y / size, np.nan)
+    if along_x:
+        return np.stack([x, y, np.cross(x, y)], axis=2)
     return np.stack([np.cross(y, z), y, z], axis=2)
 
 

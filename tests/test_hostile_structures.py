@@ -14,10 +14,14 @@ import pytest
 from marcha.export import export
 from marcha.export.labels import read_labels
 from marcha.ingest import convert
+from marcha.ingest.anatomy import frame
 from marcha.ingest.workbook import MOST_CELLS, read_workbook
-from marcha.recording import MarchaError
+from marcha.recording import MarchaError, UsageError
+from marcha.viz import domain_figures
 from marcha.viz.canvas import columns_of
+from marcha.viz.figures import figure
 
+from .cli_helpers import marcha
 from .contracts.exporter import example
 from .radio_samples import workbook
 
@@ -176,3 +180,59 @@ def test_a_topic_of_hundreds_of_signs_has_a_short_name_in_bids(tmp_path: Path) -
 def test_a_declared_value_that_no_message_has_is_drawn_as_missing() -> None:
     drawn = columns_of(pl.DataFrame({"shoe": [1.0, 2.0]}), ["shoe", "threshold"], [2.0, 1.0])
     np.testing.assert_array_equal(drawn, [[2.0, np.nan], [4.0, np.nan]])
+
+
+# -- tables beside a log -----------------------------------------------------------------------------------
+
+
+def test_footprints_beyond_any_clock_are_one_line(tmp_path: Path) -> None:
+    from .test_import_foot_formats import TestSensorConnectCsv
+
+    log = TestSensorConnectCsv().sample(tmp_path)
+    (table,) = [p for p in tmp_path.iterdir() if "strideIndex" in p.name]
+    lines = table.read_text().splitlines()
+    cells = lines[-1].split(",")
+    cells[lines[0].split(",").index("timestamp")] = "1e30"
+    table.write_text("\n".join([*lines[:-1], ",".join(cells)]) + "\n")
+    with pytest.raises(MarchaError, match="beyond any clock"):
+        convert(log, tmp_path / "out.mcap", format="sensorconnect-csv")
+
+
+# -- figures -----------------------------------------------------------------------------------------------
+
+
+def test_what_is_left_of_a_damaged_recording_has_a_report(tmp_path: Path) -> None:
+    """A channel whose chunk is lost counts messages and gives none: a figure of it is left out."""
+    path = example(tmp_path / "a.mcap", 200)
+    data = bytearray(path.read_bytes())
+    with mr.open(path) as rec:
+        source = rec._source("/foot/imu1")
+        (chunk,) = rec.chunk_refs(set(source.ids), None, None)
+    data[chunk.start + 200] ^= 0xFF
+    path.write_bytes(data)
+    done = marcha("report", path, "--no-picture", "-o", tmp_path / "a.html")
+    assert done.code in (0, 3), done.complaint
+    assert (tmp_path / "a.html").stat().st_size > 1000
+
+
+def test_a_figure_that_fails_on_a_sound_recording_is_a_defect(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(rec: mr.Recording, fig: object) -> None:
+        raise IndexError("0")
+
+    monkeypatch.setitem(domain_figures.FIGURES, "detector", fails)
+    path = example(tmp_path / "a.mcap", 200)
+    with mr.open(path) as rec, pytest.raises(IndexError):
+        figure(rec, kind="detector")
+    path.write_bytes(path.read_bytes()[:-4000])
+    with mr.open(path) as rec, pytest.raises(UsageError, match="no figure 'detector'"):
+        figure(rec, kind="detector")
+
+
+def test_directions_too_long_to_square_give_no_attitude() -> None:
+    long = np.array([[1e200, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    z = np.array([[0.0, 1e160, 1e160], [0.0, 1.0, 0.0]])
+    for found in (frame(z, long), frame(z, long, along_x=True)):
+        assert np.isnan(found[0]).any()
+        np.testing.assert_allclose(np.linalg.det(found[1]), 1.0, atol=1e-12)

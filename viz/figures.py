@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..recording import Recording
 from ..recording.atomic import AtomicFile
-from ..recording.errors import UsageError
+from ..recording.errors import MarchaError, UsageError
 from ..replay.references import shown_reference
 from ..replay.view import Comparison
 from . import style
@@ -71,15 +71,27 @@ def figure(recs: Recording | Sequence[Recording], *, kind: str = WALK, alignment
     ------
     UsageError
         No figure of this name, several recordings for one of another kind than ``walk``, or nothing in the
-        recording for it.
+        recording for it, also of what is left of a damaged one.
     """
+    chosen = [recs] if isinstance(recs, Recording) else list(recs)
+    try:
+        return _figure(chosen, kind, alignment)
+    except MarchaError:
+        raise
+    except Exception as error:
+        lost = next((f"{r.path}: {r.findings[0].detail}" for r in chosen if r.findings), "")
+        if not lost:
+            raise  # a defect of ours
+        raise UsageError(f"{lost}; what is left does for no figure {kind!r} ({error})") from error
+
+
+def _figure(chosen: list[Recording], kind: str, alignment: str) -> Figure:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     if kind != WALK:
         from .domain_figures import FIGURES
 
-        chosen = [recs] if isinstance(recs, Recording) else list(recs)
         if kind not in FIGURES:
             raise UsageError(f"figure {kind!r} is unknown; there are {', '.join(available_figures())}")
         if len(chosen) != 1:
@@ -89,7 +101,7 @@ def figure(recs: Recording | Sequence[Recording], *, kind: str = WALK, alignment
         FIGURES[kind](chosen[0], own)
         own.suptitle(printable(chosen[0].path.stem), fontsize=12, fontweight="bold")
         return own
-    walks = [_walk(rec, alignment) for rec in ([recs] if isinstance(recs, Recording) else recs)]
+    walks = [_walk(rec, alignment) for rec in chosen]
     if len(walks) == 1:
         size = (12.0, 7.0 if walks[0].tracks else 4.0)
     else:

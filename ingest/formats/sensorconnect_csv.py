@@ -266,11 +266,12 @@ def _footprints(path: Path, mirror: Mirror) -> tuple[pl.DataFrame, dict[str, str
     if not (t.diff().drop_nulls() > 0).all():
         line = int(table["line"].filter((t.diff() <= 0).fill_null(False))[0])
         raise MarchaError(f"{path}, line {line}: timestamp does not grow; repair the table")
+    table = with_ticks(table, "timestamp", 1e9, report)
     xy = table.select("gcpX", "gcpY").to_numpy() * MIRRORS[mirror][:2]
     length = float(np.linalg.norm(np.diff(xy, axis=0), axis=1).sum())
     closed = bool(np.linalg.norm(xy[-1] - xy[0]) <= CLOSED * length)
     channel = table.select(
-        t_ns=(pl.col("timestamp") * 1e9).round().cast(pl.Int64),
+        t_ns=pl.col("t"),
         pos_x=pl.Series(xy[:, 0]),
         pos_y=pl.Series(xy[:, 1]),
         pos_z=pl.lit(0.0),

@@ -325,7 +325,10 @@ class _File:
                 subject=name,
             )
             value = value.zip_with(~comma, dotted.cast(pl.Float64, strict=False))
-        value = self._readable(name, text, _only(value, value.is_finite()), lines)
+        sound = value.is_finite()
+        if target.kind == "time":
+            sound &= (value * target.factor + target.offset).abs() <= MOST_NS
+        value = self._readable(name, text, _only(value, sound), lines)
         value = value * target.factor + target.offset
         return value.round(0).cast(pl.Int64) if target.kind == "time" else value
 

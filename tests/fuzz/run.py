@@ -261,7 +261,7 @@ def run_all(
     log: Path | None = None,
 ) -> None:
     """Run inputs of the chosen targets, a few in one process, and add what became of them to ``result``."""
-    said = 0
+    thousands = 0
     for target, todo in _in_groups(chosen, numbers):
 
         def once(number: int, target: Target = target) -> None:
@@ -269,14 +269,14 @@ def run_all(
                 target.run(generator(seed, target.name, number), folder)
 
         while todo:
-            went_well = together([partial(once, number) for number in todo])
+            went_well, why = together([partial(once, number) for number in todo])
             for number, cpu_s in zip(todo, went_well, strict=False):
                 result.add(target.name, number, Verdict(cpu_s=cpu_s))
             if len(went_well) < len(todo):
-                _alone(result, target, todo[len(went_well)], place, seed, keep, log)
+                _alone(result, target, todo[len(went_well)], why, place, seed, keep, log)
             todo = todo[len(went_well) + 1 :]
-        if result.inputs // 1000 > said:
-            said = result.inputs // 1000
+        if result.inputs // 1000 > thousands:
+            thousands = result.inputs // 1000
             _say(log, {"inputs": result.inputs, "failures": result.failures})
 
 
@@ -295,13 +295,20 @@ def _in_groups(chosen: Sequence[Target], numbers: Sequence[int]) -> Iterator[tup
 
 
 def _alone(
-    result: Result, target: Target, number: int, place: Path, seed: int, keep: Path | None, log: Path | None
+    result: Result,
+    target: Target,
+    number: int,
+    said: str,
+    place: Path,
+    seed: int,
+    keep: Path | None,
+    log: Path | None,
 ) -> None:
-    """Run again, in a process of its own, an input with which not all went well."""
+    """Run again, in a process of its own, an input with which not all went well: ``said`` is how."""
     with emptied(place) as folder:
         _, verdict = in_child(lambda: target.run(generator(seed, target.name, number), folder))
         if not verdict.kind:
-            verdict = Verdict("only after others", f"of {target.name}, in the same process", verdict.cpu_s)
+            verdict = Verdict("only after others", f"of {target.name}: {said}", verdict.cpu_s)
         new = f"{verdict.kind} {_place(verdict.detail)}" not in result.failed
         result.add(target.name, number, verdict)
         if new:

@@ -92,16 +92,20 @@ def in_child(
     return words[0].result, Verdict(words[0].kind, words[0].detail, used)
 
 
-def together(tasks: Sequence[Callable[[], Any]]) -> list[float]:
+def together(tasks: Sequence[Callable[[], Any]]) -> tuple[list[float], str]:
     """Run tasks one after another in one process, up to the first that does not go well.
 
     Returns
     -------
     list of float
         Processor time (s) of each task that went well; where they are fewer than the tasks, the next did not.
+    str
+        What is known of that one.
     """
-    data, *_ = _forked(tasks, CPU_S, MEMORY_BYTES)
-    return [word.cpu_s for word in _words(data) if not word.kind]
+    data, late, status, _ = _forked(tasks, CPU_S, MEMORY_BYTES)
+    words = _words(data)
+    said = [f"{word.kind} {word.detail[-800:]}" for word in words if word.kind]
+    return [w.cpu_s for w in words if not w.kind], said[0] if said else f"late {late}, status {status}"
 
 
 class _Word(NamedTuple):
