@@ -50,7 +50,7 @@ CLIP_SAMPLES = 2
 GRAVITY = 9.80665
 
 
-class Found(NamedTuple):
+class RuleMarks(NamedTuple):
     """What a rule found in one channel: tier, channel, intervals and their labels."""
 
     tier: str
@@ -61,7 +61,7 @@ class Found(NamedTuple):
     metadata: list[dict[str, Any]] | None = None
 
 
-Rule = Callable[[Recording, Selection], Iterator[Found]]
+Rule = Callable[[Recording, Selection], Iterator[RuleMarks]]
 
 
 def apply_rules(
@@ -147,24 +147,24 @@ def _table(rec: Recording, topic: str, selection: Selection) -> pl.DataFrame:
     return rec.table(topic, start_ns=selection.start_ns, end_ns=selection.end_ns)
 
 
-def stances(rec: Recording, selection: Selection) -> Iterator[Found]:
+def stances(rec: Recording, selection: Selection) -> Iterator[RuleMarks]:
     """Stances: from the first to the last still sample, tier ``<run>/stance``."""
     for topic in _topics(rec, STANCE, selection, estimates=True):
         table = _table(rec, topic, selection)
         t_ns = table["t_ns"].to_numpy()
         first, last = _stretches(table["still"].to_numpy())
-        yield Found(f"{_run(topic)}/stance", topic, t_ns[first], t_ns[last], ["stance"] * len(first))
+        yield RuleMarks(f"{_run(topic)}/stance", topic, t_ns[first], t_ns[last], ["stance"] * len(first))
 
 
-def swings(rec: Recording, selection: Selection) -> Iterator[Found]:
+def swings(rec: Recording, selection: Selection) -> Iterator[RuleMarks]:
     """Swings: from the last still sample of a stance to the first of the next, tier ``<run>/swing``."""
     for stance in stances(rec, selection):
         start, end = stance.end_ns[:-1], stance.start_ns[1:]
         tier = f"{stance.tier.removesuffix('stance')}swing"
-        yield Found(tier, stance.channel, start, end, ["swing"] * len(start))
+        yield RuleMarks(tier, stance.channel, start, end, ["swing"] * len(start))
 
 
-def steps(rec: Recording, selection: Selection) -> Iterator[Found]:
+def steps(rec: Recording, selection: Selection) -> Iterator[RuleMarks]:
     """Steps as the estimator counts them, tier ``<run>/step``."""
     for topic in _topics(rec, STEP, selection, estimates=True):
         table = _table(rec, topic, selection)
@@ -173,7 +173,7 @@ def steps(rec: Recording, selection: Selection) -> Iterator[Found]:
             for row in table.iter_rows(named=True)
         ]
         labels = [f"step {i}" for i in table["index"]]
-        yield Found(
+        yield RuleMarks(
             f"{_run(topic)}/step",
             topic,
             table["start_ns"].to_numpy(),
@@ -183,7 +183,7 @@ def steps(rec: Recording, selection: Selection) -> Iterator[Found]:
         )
 
 
-def turns(rec: Recording, selection: Selection) -> Iterator[Found]:
+def turns(rec: Recording, selection: Selection) -> Iterator[RuleMarks]:
     """Turns between steps: at least :data:`TURN_DEG` in one direction without a straight step between.
 
     From the end of the last step of the old direction to the start of the first of the new one.
@@ -202,10 +202,10 @@ def turns(rec: Recording, selection: Selection) -> Iterator[Found]:
                     ends.append(start[j + 1])
                     labels.append(word)
                     facts.append({"angle_deg": f"{angle:.1f}", "steps": str(j - i + 1)})
-        yield _found(f"{_run(topic)}/turn", topic, begins, ends, labels, facts)
+        yield _in_order(f"{_run(topic)}/turn", topic, begins, ends, labels, facts)
 
 
-def stairs(rec: Recording, selection: Selection) -> Iterator[Found]:
+def stairs(rec: Recording, selection: Selection) -> Iterator[RuleMarks]:
     """Flights of stairs: at least :data:`STAIR_STEPS` steps in a row that gain, or lose, height."""
     for topic in _topics(rec, STEP, selection, estimates=True):
         table = _table(rec, topic, selection)
@@ -219,10 +219,10 @@ def stairs(rec: Recording, selection: Selection) -> Iterator[Found]:
                     ends.append(end[j])
                     labels.append(word)
                     facts.append({"height_m": f"{height[i : j + 1].sum():.3f}", "steps": str(j - i + 1)})
-        yield _found(f"{_run(topic)}/stair", topic, begins, ends, labels, facts)
+        yield _in_order(f"{_run(topic)}/stair", topic, begins, ends, labels, facts)
 
 
-def jumps(rec: Recording, selection: Selection) -> Iterator[Found]:
+def jumps(rec: Recording, selection: Selection) -> Iterator[RuleMarks]:
     """Jumps: the specific force stays below :data:`JUMP_SHARE` of gravity for :data:`JUMP_S` or longer."""
     for topic in _topics(rec, IMU, selection, estimates=False):
         if "acc_x" not in rec.channels[topic].columns:
@@ -236,26 +236,28 @@ def jumps(rec: Recording, selection: Selection) -> Iterator[Found]:
         facts = [
             {"flight_s": f"{s:.3f}", "height_m": f"{GRAVITY * s * s / 8:.3f}"} for s in seconds[kept].tolist()
         ]
-        yield Found(f"jump{topic}", topic, t_ns[first[kept]], t_ns[last[kept]], ["jump"] * len(facts), facts)
+        yield RuleMarks(
+            f"jump{topic}", topic, t_ns[first[kept]], t_ns[last[kept]], ["jump"] * len(facts), facts
+        )
 
 
-def gaps(rec: Recording, selection: Selection) -> Iterator[Found]:
+def gaps(rec: Recording, selection: Selection) -> Iterator[RuleMarks]:
     """Gaps of a sensor: more than :data:`GAP_TIMES` usual intervals between two readings."""
     for topic in _topics(rec, IMU, selection, estimates=False):
         t_ns = _table(rec, topic, selection)["t_ns"].to_numpy()
         yield _gaps(f"gap{topic}", topic, t_ns, 0.0, "gap")
 
 
-def _gaps(tier: str, topic: str, t_ns: Times, least_s: float, label: str) -> Found:
+def _gaps(tier: str, topic: str, t_ns: Times, least_s: float, label: str) -> RuleMarks:
     steps = np.diff(t_ns)
     usual = float(np.median(steps)) if len(steps) else 0.0
     gap_rows = (
         np.flatnonzero(steps > max(GAP_TIMES * usual, least_s * 1e9)) if usual > 0 else np.zeros(0, np.intp)
     )
-    return Found(tier, topic, t_ns[gap_rows], t_ns[gap_rows + 1], [label] * len(gap_rows))
+    return RuleMarks(tier, topic, t_ns[gap_rows], t_ns[gap_rows + 1], [label] * len(gap_rows))
 
 
-def clips(rec: Recording, selection: Selection) -> Iterator[Found]:
+def clips(rec: Recording, selection: Selection) -> Iterator[RuleMarks]:
     """Clipping: an axis stays at its largest (or smallest) value for :data:`CLIP_SAMPLES` readings."""
     for topic in _topics(rec, IMU, selection, estimates=False):
         table = _table(rec, topic, selection)
@@ -273,7 +275,7 @@ def clips(rec: Recording, selection: Selection) -> Iterator[Found]:
                         if j - i + 1 >= CLIP_SAMPLES and _saturated(values, float(limit)):
                             full[i : j + 1] = True
             first, last = _stretches(full)
-            yield Found(f"clip{topic}", topic, t_ns[first], t_ns[last], [f"clip {group}"] * len(first))
+            yield RuleMarks(f"clip{topic}", topic, t_ns[first], t_ns[last], [f"clip {group}"] * len(first))
 
 
 def _saturated(values: NDArray[np.float64], limit: float) -> bool:
@@ -289,7 +291,7 @@ def _saturated(values: NDArray[np.float64], limit: float) -> bool:
     return bool(jump > 0.02 * abs(limit))
 
 
-def lost_fixes(rec: Recording, selection: Selection) -> Iterator[Found]:
+def lost_fixes(rec: Recording, selection: Selection) -> Iterator[RuleMarks]:
     """Stretches without a fix: longer than :data:`FIX_S` and than :data:`GAP_TIMES` usual intervals."""
     for topic in _topics(rec, FIX, selection, estimates=False):
         table = _table(rec, topic, selection)
@@ -298,12 +300,12 @@ def lost_fixes(rec: Recording, selection: Selection) -> Iterator[Found]:
         yield _gaps(f"fix{topic}", topic, table["t_ns"].to_numpy(), FIX_S, "fix lost")
 
 
-def _found(
+def _in_order(
     tier: str, topic: str, begins: list[Any], ends: list[Any], labels: list[str], facts: list[dict[str, Any]]
-) -> Found:
+) -> RuleMarks:
     start, end = np.array(begins, np.int64), np.array(ends, np.int64)
     order = np.argsort(start, kind="stable")
-    return Found(
+    return RuleMarks(
         tier,
         topic,
         start[order],

@@ -120,17 +120,17 @@ def name_of(marker: str) -> tuple[str, str]:
                 side = _SIDE[words.pop(position)]
                 return side, "".join(words)
     whole = "".join(words)
-    if _known(whole):
+    if _names_a_role(whole):
         return "", whole
     for word, side in (("left", "left"), ("right", "right"), ("l", "left"), ("r", "right")):
-        if whole.startswith(word) and _known(whole[len(word) :]):
+        if whole.startswith(word) and _names_a_role(whole[len(word) :]):
             return side, whole[len(word) :]
-        if whole.endswith(word) and _known(whole[: -len(word)]):
+        if whole.endswith(word) and _names_a_role(whole[: -len(word)]):
             return side, whole[: -len(word)]
     return "", whole
 
 
-def _known(rest: str) -> bool:
+def _names_a_role(rest: str) -> bool:
     return rest in _ROLE or _cluster_of(rest) is not None
 
 

@@ -77,7 +77,7 @@ class CeilingSearch:
             waves.sort(key=lambda w: -float(w[1].max(initial=0.0)))
             del waves[KEPT // 2 :]
 
-    def found(self) -> list[tuple[float, int, int]]:
+    def ceilings(self) -> list[tuple[float, int, int]]:
         """Return (ceiling in rad/s with its sign, half-waves that reach it, line of the first) for each sign."""
         if self._open is not None:
             self._close(*self._open)

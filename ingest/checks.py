@@ -161,7 +161,7 @@ class SensorCheck:
                         subject=f"{self._subject} {self._columns[i]}",
                     )
         for name, search in self._ceilings.items():
-            for ceiling, waves, line in search.found() if name not in self._clipped else ():
+            for ceiling, waves, line in search.ceilings() if name not in self._clipped else ():
                 self._report.loss(
                     "clipped",
                     f"{self._subject} {name}: {waves} turns flatten near {ceiling:.3g} rad/s, below the nominal "

@@ -198,8 +198,8 @@ def _refine(sides: Sequence[_Even], offset: float, band_hz: float) -> _Fit:
                     f"alignment: the two overlap by less than {LEAST_S:g} s: no common motion in time"
                 )
             overlap = max(overlap, float(inside.sum() / RATE_HZ))
-            now = _at(shifted[inside], s.ta, s.a)
-            rise = _at(shifted[inside], s.ta, s.slope)
+            now = _interpolated(shifted[inside], s.ta, s.a)
+            rise = _interpolated(shifted[inside], s.ta, s.slope)
             y = np.column_stack((s.b[inside], np.ones(inside.sum())))
             # What A and b can explain is taken out of the residual and of the slopes (variable projection).
             lever = rise * (s.tb[inside] - middle)[:, None]
@@ -222,7 +222,7 @@ def _refine(sides: Sequence[_Even], offset: float, band_hz: float) -> _Fit:
     return _Fit(float(offset), float(drift), middle, float(sd[0]), float(sd[1]), r, overlap)
 
 
-def _at(t: FloatArray, own: FloatArray, values: FloatArray) -> FloatArray:
+def _interpolated(t: FloatArray, own: FloatArray, values: FloatArray) -> FloatArray:
     from scipy.interpolate import make_interp_spline
 
     return make_interp_spline(own, values, k=3)(t)

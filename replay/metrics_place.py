@@ -356,7 +356,7 @@ def _losses(view: RunView, track: Places, plane: Plane, reference: pl.DataFrame 
             continue
         last = int(there[within[-1]])
         before_loss = Places(track.t_ns[before], track.xy[before], track.cov[before])
-        mine = _at(before_loss, steps, last)
+        mine = _place_at(before_loss, steps, last)
         error = mine - xy[within[-1]]
         size.append(float(np.hypot(*error)))
         ratio.append(squared(error[None], before_loss.cov[-1:])[0])
@@ -368,7 +368,7 @@ def _losses(view: RunView, track: Places, plane: Plane, reference: pl.DataFrame 
     return metrics
 
 
-def _at(track: Places, steps: pl.DataFrame | None, t_ns: int) -> FloatArray:
+def _place_at(track: Places, steps: pl.DataFrame | None, t_ns: int) -> FloatArray:
     """Return where a track that goes step by step was at a time; after its end where it ended."""
     table = pl.DataFrame({"t_ns": track.t_ns, "pos_x": track.xy[:, 0], "pos_y": track.xy[:, 1], "pos_z": 0.0})
     walk = track_of(table)

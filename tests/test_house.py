@@ -155,10 +155,15 @@ VAGUE = {"found", "known", "given", "said", "at"}
 
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda p: p.relative_to(ROOT).as_posix())
-def test_variables_say_what_they_hold(path: Path) -> None:
+def test_names_say_what_they_hold(path: Path) -> None:
     public = {("viz/screenshot.py", "at")}  # screenshots(…, at=0.5): where on the time line
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        name = node.arg if isinstance(node, ast.arg) else node.id if isinstance(node, ast.Name) else ""
+        named = getattr(node, "arg", None) if isinstance(node, ast.arg) else getattr(node, "id", None)
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            named = (
+                node.name.strip("_").lower() if node.name != "at" else ""
+            )  # track.at(t_ns) says what it is
+        name = named or ""
         if (path.relative_to(ROOT).as_posix(), name) not in public:
             assert name not in VAGUE, f"{path}:{getattr(node, 'lineno', 0)}: {name}"
 

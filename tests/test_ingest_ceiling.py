@@ -18,7 +18,7 @@ def search(values: np.ndarray, block: int = 10**9) -> list[tuple[float, int, int
     found = CeilingSearch()
     for k in range(0, len(values), block):
         found.feed(values[k : k + block], np.arange(k, min(k + block, len(values))))
-    return found.found()
+    return found.ceilings()
 
 
 def swings(seed: int, ceiling: float | None, scatter: float = 0.004) -> np.ndarray:

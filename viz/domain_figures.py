@@ -53,7 +53,7 @@ def _topics(rec: Recording, needs: Sequence[str], *schemas: str, role: str = "")
     ]
 
 
-def _found(rec: Recording, what: str, topics: list[str]) -> list[str]:
+def _require(rec: Recording, what: str, topics: list[str]) -> list[str]:
     if not topics:
         raise UsageError(f"{rec.path}: nothing for this figure: no {what}")
     return topics
@@ -98,7 +98,7 @@ def signals(rec: Recording, fig: Figure) -> None:
         for key, unit in (("acc", "m/s²"), ("gyr", "rad/s"))
         for t in _topics(rec, [f"{key}_x"], "sensor_msgs/msg/Imu", role="raw")
     ]
-    _found(rec, "inertial sensor", [t for t, *_ in panels])
+    _require(rec, "inertial sensor", [t for t, *_ in panels])
     for ax, (topic, key, unit) in zip(_rows(fig, len(panels)), panels, strict=True):
         table = rec.table(topic)
         values, t = table.select(f"{key}_{a}" for a in "xyz").to_numpy(), _s(rec, table)
@@ -110,7 +110,7 @@ def signals(rec: Recording, fig: Figure) -> None:
 
 def steps(rec: Recording, fig: Figure) -> None:
     """Steps on the norm of the accelerometer, their lengths, and the distance so far."""
-    topics = _found(rec, "steps", _topics(rec, ["length_m"], "marcha_msgs/msg/Step"))
+    topics = _require(rec, "steps", _topics(rec, ["length_m"], "marcha_msgs/msg/Step"))
     top, lengths, way = _rows(fig, 3)
     sensors = _topics(rec, ["acc_x"], "sensor_msgs/msg/Imu", role="raw")
     norm: tuple[Floats, Floats] | None = None
@@ -140,7 +140,7 @@ def heading(rec: Recording, fig: Figure) -> None:
         for c in rec.channels[t].columns
         if c.endswith("_rad")
     ]
-    _found(rec, "heading", [t for t, _ in headings])
+    _require(rec, "heading", [t for t, _ in headings])
     fields = _topics(rec, ["mag_x"], "sensor_msgs/msg/MagneticField")[:1]
     axes = _rows(fig, 1 + len(fields))
     for ax, topic in zip(axes, fields, strict=False):
@@ -159,7 +159,7 @@ def heading(rec: Recording, fig: Figure) -> None:
 
 def fixes(rec: Recording, fig: Figure) -> None:
     """Fixes with their accuracy, stated tracks and reference: in degrees, and in metres about the first."""
-    topics = _found(rec, "fixes", _topics(rec, ["lat_deg", "lon_deg"]))
+    topics = _require(rec, "fixes", _topics(rec, ["lat_deg", "lon_deg"]))
     fig.set_size_inches(13.0, 6.0)
     degrees, metres = fig.subplots(1, 2)
     first: Floats | None = None
@@ -237,7 +237,7 @@ def _columns(rec: Recording, topic: str) -> tuple[str, ...]:
 
 def radio(rec: Recording, fig: Figure) -> None:
     """Signal strength by anchor: over time, as histogram, and over the true distance with the model."""
-    topic = _found(rec, "radio signals", _topics(rec, ["mac", "rssi_dbm"]))[0]
+    topic = _require(rec, "radio signals", _topics(rec, ["mac", "rssi_dbm"]))[0]
     table = rec.table(topic)
     anchors = floor_plan(loaders_of(rec)).anchors
     counts = table.group_by("mac").len().sort("len", "mac", descending=[True, False])["mac"].to_list()
@@ -282,7 +282,7 @@ def error(rec: Recording, fig: Figure) -> None:
         result = compared(trace, traces[truth], "none") if truth in traces else None
         if result is not None:
             results[topic] = result
-    _found(rec, "track with a reference", list(results))
+    _require(rec, "track with a reference", list(results))
     fig.set_size_inches(12.0, 4.5)
     over, share = fig.subplots(1, 2)
     for topic, result in results.items():
@@ -300,7 +300,7 @@ def error(rec: Recording, fig: Figure) -> None:
 def joints(rec: Recording, fig: Figure) -> None:
     """Joint angles beside reference and encoder, and the error within its stated ±1σ."""
     angles: dict[str, list[str]] = {}
-    for topic in _found(rec, "joint angles", _topics(rec, [], JOINT)):
+    for topic in _require(rec, "joint angles", _topics(rec, [], JOINT)):
         for name in rec.channels[topic].columns:
             if not name.endswith((".vel", ".effort")):
                 angles.setdefault(name, []).append(topic)
@@ -338,7 +338,7 @@ def jumps(rec: Recording, fig: Figure) -> None:
     topics = [
         t for t in _topics(rec, ["state"], NAMED, role="estimate") if "states" in rec.channels[t].metadata
     ]
-    _found(rec, "named states (metadata `states` of a channel with a column `state`)", topics)
+    _require(rec, "named states (metadata `states` of a channel with a column `state`)", topics)
     for ax, topic in zip(_rows(fig, len(topics)), topics, strict=True):
         names = [printable(n.strip()) for n in rec.channels[topic].metadata["states"].split(",")]
         table = rec.table(topic).filter(pl.col("state").is_finite())

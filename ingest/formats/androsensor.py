@@ -92,7 +92,7 @@ class AndroSensor:
         header = require_header(path, _is_header, WANTED)
         report = ReportBuilder()
         attachments: list[SourceAttachment] = []
-        columns = _known(header.names)
+        columns = _columns_of(header.names)
         if header.names[0] in SHORT:
             report.note(
                 "assumed_unit",
@@ -128,7 +128,7 @@ def _is_header(cells: Sequence[str]) -> bool:
     )
 
 
-def _known(names: Sequence[str]) -> dict[str, str]:
+def _columns_of(names: Sequence[str]) -> dict[str, str]:
     """Return what is known (``acc x``, ``lat`` …) and the name of its column."""
     columns: dict[str, str] = {}
     for name in names:

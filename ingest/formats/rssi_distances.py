@@ -91,7 +91,9 @@ class RssiDistances:
                 )
         nodes = {m for p in points for m in p.powers}
         if stated:
-            ours = {metres[f]: np.concatenate([v for _, v in _at(points, metres[f])]).mean() for f in files}
+            ours = {
+                metres[f]: np.concatenate([v for _, v in _powers_at(points, metres[f])]).mean() for f in files
+            }
             label = f"{folder.name} text files against {sheet.name if sheet else 'the spreadsheet'}"
             compare_powers(ours, {d: p for d, p in stated.values() if p is not None}, label, report)
         names = {local_address(f"{technology} {n}"): n for n in _nodes(files)}
@@ -101,7 +103,7 @@ class RssiDistances:
         return survey_import(points, anchors, report, "distances along the x axis from the anchor, m")
 
 
-def _at(points: Sequence[SurveyPoint], metres: float) -> list[tuple[str, Sequence[float]]]:
+def _powers_at(points: Sequence[SurveyPoint], metres: float) -> list[tuple[str, Sequence[float]]]:
     return [v for p in points if p.where[0] == metres for v in p.powers.values()]
 
 

@@ -43,17 +43,17 @@ class ByTransmitter(View):
             self.counts[mac] += int(mine.sum())
             self._line(mac, t_ns[mine], values[mine])
 
-    def _at(self, mac: str) -> str:
+    def _entity(self, mac: str) -> str:
         return f"{self.path}/{slug(mac)}"
 
     def _style(self, mac: str, number: int) -> None:
-        self.canvas.points(self._at(mac), printable(mac), style.run_color(number), "circle", 2.5)
+        self.canvas.points(self._entity(mac), printable(mac), style.run_color(number), "circle", 2.5)
         if number < MOST:  # a live view cannot wait for the end
             for tab in self.tabs:
-                self.canvas.show("plot", self._at(mac), tab=tab, panel=self.panel, owner=self.owner)
+                self.canvas.show("plot", self._entity(mac), tab=tab, panel=self.panel, owner=self.owner)
 
     def _line(self, mac: str, t_ns: Times, values: np.ndarray) -> None:
-        self.canvas.scalars(self._at(mac), t_ns, values)
+        self.canvas.scalars(self._entity(mac), t_ns, values)
 
     def end(self) -> None:
         if len(self.counts) <= MOST:
@@ -65,7 +65,7 @@ class ByTransmitter(View):
         panel = f"{self.panel}, {MOST} of {len(self.counts)} transmitters"
         for mac in ordered[:MOST]:
             for tab in self.tabs:
-                canvas.show("plot", self._at(mac), tab=tab, panel=panel, owner=self.owner)
+                canvas.show("plot", self._entity(mac), tab=tab, panel=panel, owner=self.owner)
 
 
 class Signals(ByTransmitter):

@@ -251,16 +251,16 @@ class Orientation(View):
         ]
         self.above = parent if kind in PARENTS and parent in above else previous(canvas, self.channel)
         self.waiting: list[tuple[Times, Floats]] = []
-        self.at = f"{self.figure}/{slug(self.segment)}"
+        self.entity = f"{self.figure}/{slug(self.segment)}"
         ends = np.array([[0.0, 0.0, 0.0], self.bone], dtype=np.float32)
         rgb = style.rgb(color)
         bone = rr.LineStrips3D([ends], colors=rgb, radii=0.02 if self.role != "reference" else 0.012)
-        canvas.static(f"{self.at}/bone", bone)
-        canvas.static(f"{self.at}/axes", rr.TransformAxes3D(0.12))
+        canvas.static(f"{self.entity}/bone", bone)
+        canvas.static(f"{self.entity}/axes", rr.TransformAxes3D(0.12))
         label = rr.Points3D([ends[1] * 0.5], labels=[self.segment], colors=rgb, radii=0.005, show_labels=True)
-        canvas.static(f"{self.at}/name", label)
+        canvas.static(f"{self.entity}/name", label)
         for part in ("bone", "axes", "name"):
-            entity_path = f"{self.at}/{part}"
+            entity_path = f"{self.entity}/{part}"
             canvas.show("space", entity_path, tab=JOINTS, panel=FIGURE, owner=self.owner)
 
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
@@ -304,7 +304,7 @@ class Orientation(View):
         columns = rr.Transform3D.columns(
             translation=start.astype(np.float32), quaternion=xyzw_from_wxyz(turn).astype(np.float32)
         )
-        self.canvas.columns(self.at, t_ns, columns)
+        self.canvas.columns(self.entity, t_ns, columns)
 
 
 class Tips:
@@ -397,11 +397,11 @@ class Markers(View):
     def begin(self) -> None:
         canvas = self.canvas
         self.names = [c.removesuffix(".x") for c in self.channel.columns if c.endswith(".x")]
-        self.at = f"{self.path}/points"
+        self.entity = f"{self.path}/points"
         canvas.static(
-            self.at, rr.Points3D.from_fields(colors=style.rgb(self.color), radii=rr.Radius.ui_points(5.0))
+            self.entity, rr.Points3D.from_fields(colors=style.rgb(self.color), radii=rr.Radius.ui_points(5.0))
         )
-        canvas.show("space", self.at, tab=JOINTS, panel=MARKERS, owner=self.owner)
+        canvas.show("space", self.entity, tab=JOINTS, panel=MARKERS, owner=self.owner)
         colors = [style.run_color(i) for i in range(len(self.names))]
         self.heights = f"{self.path}/height"
         canvas.lines(self.heights, [f"{n} z (m)" for n in self.names], colors)
@@ -418,4 +418,4 @@ class Markers(View):
         if seen.any():
             self.canvas.reach(self.canvas.solid.setdefault(MARKERS, []), places[seen])
         columns = rr.Points3D.columns(positions=places[seen].astype(np.float32)).partition(counts)
-        self.canvas.columns(self.at, t_ns, columns)
+        self.canvas.columns(self.entity, t_ns, columns)
