@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,6 +33,10 @@ _PRIVATE_KEY = re.compile(
 _FIX = "sensor_msgs/msg/NavSatFix"
 _OWN_CLOCK = "last_seen_ns"
 """Times of the receiver's own clock: no offset of the recording moves them."""
+_ADDRESS = re.compile(r"\b[0-9A-Fa-f]{2}([:-])[0-9A-Fa-f]{2}(\1[0-9A-Fa-f]{2}){4}\b")
+"""A hardware address, wherever it stands in a text."""
+_FROM = "computed_from"
+"""Member of a calibration that names its recordings, with their hashes and dates."""
 _RADIO = ("marcha_msgs/msg/RadioSignal", "marcha_msgs/msg/Ranging")
 
 
@@ -178,6 +183,7 @@ def anonymize(
         Whether ``out`` may be replaced.
     """
     removed, left = [f"dates: times begin at 0 instead of {rec.start_ns} ns"], []
+    addresses: dict[str, str] = {}
     topics = []
     for topic, channel in rec.channels.items():
         if channel.schema == EVENT or is_drawn(rec, topic):
@@ -196,12 +202,9 @@ def anonymize(
                 if _is_private(key):
                     removed.append(f"channel {topic}: {key}")
                 else:
-                    left.append(f"channel {topic}: {key} = {value}")
+                    left.append(f"channel {topic}: {key} = {_numbered(value, addresses)}")
     with Writer(out, overwrite=overwrite) as file:
-        addresses: dict[str, str] = {}
         _copy(file, rec, topics, Selection(), JoinedPart(rec, "", -rec.start_ns, "", set()), addresses)
-        if addresses:
-            removed.append(f"{len(addresses)} hardware addresses: numbered")
         marks = rec.annotations
         source = pl.when(pl.col("source").str.starts_with("human")).then(pl.lit("human")).otherwise("source")
         file.add_annotations(
@@ -223,6 +226,10 @@ def anonymize(
             first, slash, rest = record.partition("/")
             name = f"{files[first]}/{rest}" if slash and first in files else record
             kept = {k: v for k, v in values.items() if not (_is_private(k) or _ORIGIN.search(name))}
+            for key, value in kept.items():
+                whole = _without_origin(value)
+                removed += [f"metadata {record}: {key}: {_FROM}"] if whole != value else []
+                kept[key] = _numbered(whole, addresses)
             if "records" in kept:  # of a run in a joined recording
                 kept["records"] = files.get(kept["records"], kept["records"])
             removed += [f"metadata {record}: {k}" for k in values if k not in kept]
@@ -230,6 +237,8 @@ def anonymize(
             if kept:
                 file.add_metadata(name, kept)
         removed += [f"attachment {a.name}" for a in rec.attachments]
+        if addresses:
+            removed.append(f"{len(addresses)} hardware addresses: numbered")
     return Anonymized(removed, left)
 
 
@@ -277,6 +286,8 @@ def _copy(
             )
         metadata = {k: v for k, v in about.metadata.items() if addresses is None or not _is_private(k)}
         metadata = place.channel_metadata(metadata)
+        if addresses is not None:
+            metadata = {k: _numbered(v, addresses) for k, v in metadata.items()}
         columns = [c for c in about.columns if addresses is None or c != _OWN_CLOCK]
         file.add_channel(place.topic(topic), about.schema, about.frame_id, columns, metadata)
     for window in rec.windows(topics, start_ns=chosen.start_ns, end_ns=chosen.end_ns):
@@ -289,11 +300,32 @@ def _copy(
                 table = table.with_columns(pl.col([c for c in table.columns if c in moved]) + place.offset_ns)
             if addresses is not None and rec.channels[topic].schema in _RADIO:
                 for mac in table["mac"].unique(maintain_order=True).to_list():
-                    addresses.setdefault(
-                        mac, ":".join(f"{len(addresses):012x}"[k : k + 2] for k in range(0, 12, 2))
-                    )
+                    _number(mac, addresses)
                 table = table.with_columns(pl.col("mac").replace(addresses))
             file.add_table(place.topic(topic), rec.channels[topic].schema, table)
+
+
+def _without_origin(text: str) -> str:
+    """Return a calibration written as JSON without what it was computed from; any other text as it is."""
+    if f'"{_FROM}"' not in text:
+        return text
+    try:
+        value = json.loads(text)
+    except ValueError:
+        return text
+    kept = {k: [] if k == _FROM else v for k, v in value.items()} if isinstance(value, dict) else value
+    return json.dumps(kept, ensure_ascii=False)
+
+
+def _number(address: str, addresses: dict[str, str]) -> str:
+    """Return the number that stands for a hardware address, written as one."""
+    digits = f"{len(addresses):012x}"
+    return addresses.setdefault(address, ":".join(digits[k : k + 2] for k in range(0, 12, 2)))
+
+
+def _numbered(text: str, addresses: dict[str, str]) -> str:
+    """Return a text with numbers for the hardware addresses in it, but for those that are numbers already."""
+    return _ADDRESS.sub(lambda m: m[0] if m[0] in addresses.values() else _number(m[0], addresses), text)
 
 
 def _add_history(file: Writer, changes: list[Change]) -> None:

@@ -157,3 +157,27 @@ def test_no_date_and_no_file_name_is_left_of_cuts_exports_and_merges(rec: Record
     everything = str(metadata).replace("walk of Eva", "")  # the tier, which is listed
     assert not any(word in everything for word in ("eva", "ada", str(ZERO)[:6]))
     assert "metadata eva3/cut_2: start_ns" in done.removed
+
+
+def test_hardware_addresses_in_texts_are_numbered_as_those_of_the_rows(tmp_path: Path) -> None:
+    with mr.create(tmp_path / "ble.mcap") as out:
+        seen = pl.DataFrame({"t_ns": [ZERO], "mac": ["aa:bb:cc:dd:ee:ff"], "rssi_dbm": [-50.0]})
+        about = {"beacon": "E7:8F:13:56:24:CE", "heard": "aa:bb:cc:dd:ee:ff and 12:30:15 h"}
+        out.add_table("/phone/radio", "marcha_msgs/msg/RadioSignal", seen, metadata=about)
+        made = {"values": {"p_d0": -60}, "computed_from": [{"recording": "eva.mcap", "start_ns": "1"}]}
+        values = {"findings": "no power of aa:bb:cc:dd:ee:ff", "calibration.radio": json.dumps(made)}
+        out.add_metadata("run/a", values)
+    found = anonymize(mr.open(tmp_path / "ble.mcap"), tmp_path / "b.mcap")
+    anonymous = mr.open(tmp_path / "b.mcap")
+    mac = anonymous.table("/phone/radio")["mac"][0]
+    texts = anonymous.channels["/phone/radio"].metadata
+    assert texts["heard"] == f"{mac} and 12:30:15 h"
+    assert texts["beacon"] != mac
+    values = anonymous.metadata["run/a"]
+    assert values["findings"] == f"no power of {mac}"
+    assert json.loads(values["calibration.radio"]) == {**made, "computed_from": []}
+    assert "metadata run/a: calibration.radio: computed_from" in found.removed
+    assert "2 hardware addresses: numbered" in found.removed
+    left = (tmp_path / "b.mcap").read_bytes().lower() + "".join(found.left).lower().encode()
+    assert b"aa:bb" not in left
+    assert b"e7:8f" not in left
