@@ -302,6 +302,9 @@ class Importer(Protocol):
     folders : bool
         Whether a folder or archive can be one recording although ``sniff`` does not know it. Optional; false
         where it is missing.
+    floors : bool
+        Whether its folders hold the anchor table and the plan as well (:mod:`.floor`). Optional; false where it is
+        missing.
     chief : callable
         ``chief(path) -> Path``: the file or folder that stands for the recording of several files that ``path`` is
         one of. Optional; each file is a recording of its own where it is missing.

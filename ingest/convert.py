@@ -26,7 +26,7 @@ from .contract import (
     ReportBuilder,
     SourceAttachment,
 )
-from .floor import Floor, kind_of, read_floor
+from .floor import Floor, floor_files, kind_of, read_floor
 from .legchecks import LegWatch
 from .mapping import mapping_format
 from .radio import RadioWatch, addresses
@@ -131,7 +131,9 @@ def convert(
         )
         settings = registry.share_options(recognised, chosen)
         floor_report = ReportBuilder()
-        floor = read_floor(beside, place, floor_report)
+        own = [f for (registered, files) in recognised for f in floor_files(registered.importer, files)]
+        given = {kind_of(p) for p in beside}  # what the user names beside a log goes before its own
+        floor = read_floor([*beside, *(f for f in own if kind_of(f) not in given)], place, floor_report)
         floor.attachments += read_underlay(under)
         beside += under
         side_files = [read_truth(source.files[0]) for source in recognised]
@@ -260,7 +262,8 @@ def _beside(report: Report, floor: Report) -> Report:
 
 def _apart(sources: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     """Return the logs, and the anchor table and plan among what was given."""
-    beside = [p for p in sources if kind_of(p) and not registry.recognise(p)]
+    kinds = {p: kind_of(p) for p in sources}  # a picture's eight bytes say more than the one that marks C3D
+    beside = [p for p in sources if kinds[p] == "picture" or (kinds[p] and not registry.recognise(p))]
     logs = [p for p in sources if p not in beside]
     if not logs:
         if not beside:

@@ -1,9 +1,9 @@
 """Anchors and the plan of a floor, given beside a log: they go into the recording as attachments.
 
-An anchor table is a text table with a header that names at least an address, x and y. A plan is GeoJSON (metres, or
-degrees, which are laid out in metres from the south-west corner) or a picture with a scale. What a picture or
-an outline does not say itself stands in a JSON file (``width_m``, ``height_m`` or ``metres_per_pixel``, ``x_m``,
-``y_m`` of the lower left corner, ``x_axis_azimuth_deg``, ``handedness``), or is set as ``plan.width_m=…``.
+An anchor table: :mod:`.anchors`. A plan is GeoJSON (metres, or degrees, which are laid out in metres from the
+south-west corner) or a picture with a scale. What a picture or an outline does not say itself stands in a JSON file
+(``width_m``, ``height_m`` or ``metres_per_pixel``, ``x_m``, ``y_m`` of the lower left corner, ``x_axis_azimuth_deg``,
+``handedness``), or is set as ``plan.width_m=…``.
 """
 
 from __future__ import annotations
@@ -16,28 +16,16 @@ from pathlib import Path
 from typing import Any
 
 from ..recording.errors import MarchaError, UsageError
+from .anchors import DEGREES_SPAN, Layout, is_anchor_header, layout_of, read_anchors
 from .contract import ReportBuilder, SourceAttachment
-from .headers import TableHeader, header_of, numbers, read_cells
-from .radio import anchor_table, local_address, technology_of
+from .headers import header_of
 from .text import start_of
 
-ANCHOR_ROLES = {
-    "mac": r"mac|mac address|bssid|address|beacon|anchor|ap|id|node",
-    "x": r"x|pos x|x m",
-    "y": r"y|pos y|y m",
-    "z": r"z|pos z|height|h|altura",
-    "p_d0": r"p d0|p0|rssi d0|(mean )?rssi (at )?1 ?m|rssi 1m|power (at )?1 ?m|tx ?power|a",
-    "eta": r"eta|η|n|exponent|path ?loss( exponent)?|propagation( constant)?",
-    "technology": r"technology|tech|type|kind|radio|tecnologia",
-    "name": r"name|label|nome",
-}
 PLACE_KEYS = ("width_m", "height_m", "metres_per_pixel", "x_m", "y_m", "x_axis_azimuth_deg")
 KINDS = ("wall", "obstacle", "passable", "room", "zone")
+EAST_DEG = 90.0
+"""Azimuth of the x axis of what was laid out from degrees."""
 PICTURES = {b"\x89PNG\r\n\x1a\n": ("plan.png", "image/png"), b"\xff\xd8\xff": ("plan.jpg", "image/jpeg")}
-DEGREES_SPAN = 0.05
-"""Coordinates that span less than this are degrees: 0.05 m is no building, 0.05° are 5 km."""
-EARTH_M = 6_378_137.0 * math.pi / 180.0
-"""Metres in a degree of the sphere that web maps are drawn on."""
 
 
 @dataclass
@@ -74,11 +62,11 @@ def kind_of(path: Path) -> str:
     return "anchors" if header is not None and is_anchor_header(header) else ""
 
 
-def is_anchor_header(header: TableHeader) -> bool:
-    """Whether a header names addresses and places, and neither times nor powers of a log."""
-    there = header.roles(ANCHOR_ROLES)
-    logged = header.roles({"time": r"time|timestamp|t|t ns|ms|date", "sensor": r"sensor.*"})
-    return {"mac", "x", "y"} <= set(there) and not logged
+def floor_files(importer: object, paths: Sequence[Path]) -> list[Path]:
+    """Return the parts of a floor in a log's own folders, where its importer says that they hold some (``floors``)."""
+    if not getattr(importer, "floors", False):
+        return []
+    return [f for p in paths if p.is_dir() for f in sorted(p.iterdir()) if kind_of(f)]
 
 
 def read_floor(paths: Sequence[Path], settings: Mapping[str, Any], report: ReportBuilder) -> Floor:
@@ -108,12 +96,10 @@ def read_floor(paths: Sequence[Path], settings: Mapping[str, Any], report: Repor
     if unknown:
         raise UsageError(f"plan.{min(unknown)}: a plan has {', '.join((*PLACE_KEYS, 'handedness', 'rooms'))}")
     floor = Floor()
-    if "anchors" in by_kind:
-        table, floor.anchors = read_anchors(by_kind["anchors"], report)
-        floor.attachments.append(table)
+    layout: Layout | None = None
     place = _place(by_kind.get("place"), by_kind.get("picture") or by_kind.get("outline"), settings)
     if "outline" in by_kind:
-        data, place = _outline(by_kind["outline"], place, str(settings.get("rooms", "room")))
+        data, place, layout = _outline(by_kind["outline"], place, str(settings.get("rooms", "room")))
         floor.attachments.append(SourceAttachment("plan.geojson", data, "application/geo+json"))
     if "picture" in by_kind:
         path = by_kind["picture"]
@@ -129,47 +115,14 @@ def read_floor(paths: Sequence[Path], settings: Mapping[str, Any], report: Repor
         floor.attachments.append(
             SourceAttachment("plan.json", json.dumps(place).encode(), "application/json")
         )
+    if "anchors" in by_kind:
+        drawn = by_kind.get("outline") or by_kind.get("picture")
+        table, floor.anchors, own = read_anchors(by_kind["anchors"], report, layout=layout, drawn=drawn)
+        floor.attachments.insert(0, table)
+        if own is not None:
+            place = {"x_axis_azimuth_deg": EAST_DEG, **place}
     floor.metadata = {k: str(place[k]) for k in ("x_axis_azimuth_deg", "handedness") if k in place}
     return floor
-
-
-def read_anchors(path: Path, report: ReportBuilder) -> tuple[SourceAttachment, tuple[str, ...]]:
-    """Return the attachment ``anchors.csv`` of a table in whatever order and names, and the addresses.
-
-    Raises
-    ------
-    MarchaError
-        A row without address, x or y, or an address twice; names the line.
-    """
-    header = header_of(start_of(path, 65536))
-    places = header.roles(ANCHOR_ROLES) if header is not None else {}
-    if header is None or not {"mac", "x", "y"} <= set(places):
-        raise MarchaError(f"{path}: no header with an address (mac), x and y; an anchor table has them")
-    cells = read_cells(path, places, header, report)
-    cells = numbers(cells, tuple(r for r in ("x", "y", "z", "p_d0", "eta") if r in places), path, report)
-    rows: list[dict[str, Any]] = []
-    for row in cells.iter_rows(named=True):
-        if not row["mac"] or not (math.isfinite(row["x"]) and math.isfinite(row["y"])):
-            raise MarchaError(
-                f"{path}, line {row['line']}: an anchor has an address, x and y (m); mend the row"
-            )
-        mac = local_address(row["mac"])
-        if any(mac == other["mac"] for other in rows):
-            raise MarchaError(f"{path}, line {row['line']}: {row['mac']} is there twice; keep one of them")
-        power = row.get("p_d0", math.nan)
-        if power > 0:
-            report.repair(
-                "repaired_sign",
-                f"{path.name}: power at 1 m {power:g} is stored without its sign: taken as {-power:g} dBm",
-                line=row["line"],
-                subject=f"{path.name} p_d0",
-                rows=0,
-            )
-            row["p_d0"] = -power
-        name = row.get("name") or (row["mac"] if mac != row["mac"].lower() else "")
-        technology = technology_of(row.get("technology") or "")
-        rows.append({**row, "mac": mac, "name": name, "technology": technology})
-    return anchor_table(rows), tuple(r["mac"] for r in rows)
 
 
 def _place(file: Path | None, beside: Path | None, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -219,8 +172,8 @@ def _filled(place: Mapping[str, Any], picture: Path) -> dict[str, Any]:
     return {**{k: v for k, v in place.items() if k != "metres_per_pixel"}, **sides}
 
 
-def _outline(file: Path, place: Mapping[str, Any], rooms: str) -> tuple[bytes, dict[str, Any]]:
-    """Return GeoJSON in metres, each feature with a ``kind``, and where it lies."""
+def _outline(file: Path, place: Mapping[str, Any], rooms: str) -> tuple[bytes, dict[str, Any], Layout | None]:
+    """Return GeoJSON in metres, each feature with a ``kind``, where it lies, and how degrees were laid out."""
     if rooms not in KINDS:
         raise UsageError(f"plan.rooms={rooms!r}: one of {', '.join(KINDS)}")
     try:
@@ -233,14 +186,11 @@ def _outline(file: Path, place: Mapping[str, Any], rooms: str) -> tuple[bytes, d
         raise MarchaError(f"{file}: is no GeoJSON FeatureCollection with coordinates: {error!r}") from None
     about = {**{k: plan[k] for k in (*PLACE_KEYS, "handedness") if k in plan}, **place}
     span = [high[k] - low[k] for k in (0, 1)]
-    move = None
+    layout = None
     if 0 < max(span) < DEGREES_SPAN:
-        narrow = math.cos(math.radians((low[1] + high[1]) / 2))
-        size = (about.get("width_m", span[0] * narrow * EARTH_M), about.get("height_m", span[1] * EARTH_M))
-        scale = [size[k] / span[k] if span[k] else 0.0 for k in (0, 1)]
-        move = lambda p: [round(scale[k] * (p[k] - low[k]), 4) for k in (0, 1)]  # noqa: E731 - local formula
-        about |= {"width_m": size[0], "height_m": size[1]}
-        about.setdefault("x_axis_azimuth_deg", 90.0)  # longitude runs to the east
+        layout = layout_of(low, high, about.get("width_m"), about.get("height_m"))
+        about |= {"width_m": layout.scale[0] * span[0], "height_m": layout.scale[1] * span[1]}
+        about.setdefault("x_axis_azimuth_deg", EAST_DEG)  # longitude runs to the east
     made = []
     for feature in features:
         facts = dict(feature.get("properties") or {})
@@ -248,12 +198,12 @@ def _outline(file: Path, place: Mapping[str, Any], rooms: str) -> tuple[bytes, d
         if facts.get("kind") not in KINDS and feature["geometry"]["type"].endswith("Polygon"):
             facts["kind"] = "passable" if floor else rooms
         geometry = feature["geometry"]
-        if move is not None:
-            geometry = {**geometry, "coordinates": _mapped(geometry["coordinates"], move)}
+        if layout is not None:
+            geometry = {**geometry, "coordinates": _mapped(geometry["coordinates"], layout)}
         made.append({"type": "Feature", "properties": facts, "geometry": geometry})
     kept = {k: v for k, v in about.items() if k != "metres_per_pixel"}
     collection = {"type": "FeatureCollection", **kept, "features": made}
-    return json.dumps(collection, ensure_ascii=False).encode(), about
+    return json.dumps(collection, ensure_ascii=False).encode(), about, layout
 
 
 def _points(node: Any) -> Iterator[Any]:
@@ -264,5 +214,7 @@ def _points(node: Any) -> Iterator[Any]:
             yield from _points(part)
 
 
-def _mapped(node: Any, move: Any) -> Any:
-    return move(node) if node and isinstance(node[0], int | float) else [_mapped(part, move) for part in node]
+def _mapped(node: Any, layout: Layout) -> Any:
+    if node and isinstance(node[0], int | float):
+        return list(layout.metres(node[0], node[1]))
+    return [_mapped(part, layout) for part in node]

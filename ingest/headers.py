@@ -20,6 +20,7 @@ from .contract import ReportBuilder
 from .text import start_of
 
 UNIT = re.compile(r"[\[(]([^\])]*)[\])]")
+DECIMAL_COMMA = r"^([+-]?\d+),(\d+)$"
 _BETWEEN = re.compile(r"[\s_\-.:]+")
 SECONDS = {"s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 EPOCHS = ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0))
@@ -130,12 +131,13 @@ def read_cells(
         )
     rows = rows.filter(fits)
     parts = rows["row"].str.split_exact(header.separator, width - 1).struct.unnest()
-    return pl.DataFrame(
-        {
-            "line": rows["line"],
-            **{role: parts[f"field_{i}"].str.strip_chars(' "') for role, i in places.items()},
-        }
-    )
+    cells = {role: parts[f"field_{i}"].str.strip_chars(' "') for role, i in places.items()}
+    if header.separator != ",":
+        count = sum(int(text.str.contains(DECIMAL_COMMA).sum()) for text in cells.values())
+        if count:
+            report.note("decimal_comma", f"{path.name}: decimal commas are read as points", count=count)
+            cells = {r: text.str.replace(DECIMAL_COMMA, "${1}.${2}") for r, text in cells.items()}
+    return pl.DataFrame({"line": rows["line"], **cells})
 
 
 def numbers(cells: pl.DataFrame, roles: tuple[str, ...], path: Path, report: ReportBuilder) -> pl.DataFrame:

@@ -18,6 +18,17 @@ HEADING_M = 2.0
 """Horizontal way from the start that gives the heading where a track has no orientation."""
 
 
+def on_a_plan(estimate_frame: str, reference_frame: str) -> Alignment | None:
+    """Return how an estimate is laid upon a reference on a floor plan; None where one of them is not on one.
+
+    ``none`` where both are positions on the plan: there an alignment would hide the error. ``origin`` where the
+    estimate has the plan's axes and starts at an unknown place of it.
+    """
+    if reference_frame != "plan":
+        return None
+    return {"plan": "none", "plan-axes": "origin"}.get(estimate_frame)  # type: ignore[return-value]
+
+
 @dataclass(frozen=True)
 class Transform:
     """Takes the estimate's coordinates to the reference's: ``p_ref = scale · rotation @ p_est + translation``.

@@ -259,3 +259,15 @@ def _correction(steps: Sequence[tuple[tuple[str, ...], FloatArray, FloatArray]])
         return table
 
     return correct
+
+
+def calibrations_of_runs(metadata: Mapping[str, Mapping[str, str]]) -> list[Calibration]:
+    """Return the calibrations that runs of a recording were given, as its metadata say."""
+    texts = {
+        value
+        for name, record in metadata.items()
+        if name.startswith("run/")
+        for key, value in record.items()
+        if key.startswith("calibration.")
+    }
+    return [msgspec.json.decode(text, type=Calibration) for text in sorted(texts)]

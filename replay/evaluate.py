@@ -13,7 +13,7 @@ import polars as pl
 
 from ..recording import Recording
 from ..recording.errors import MarchaError, UsageError
-from .alignment import IntArray
+from .alignment import IntArray, on_a_plan
 from .gaitcycles import JointCycles, cycles
 from .metrics import available_metrics
 from .metrics_joint import doubts
@@ -313,12 +313,10 @@ def _surveyed(rec: Recording) -> pl.DataFrame:
 def usual_alignment(rec: Recording | None, lineage: Mapping[str, str], track: str | None) -> str:
     """Return how a run is laid upon its reference where the user does not say.
 
-    ``none`` where both are positions on one floor plan: there an alignment would hide the error. ``origin`` where the
-    estimate has the plan's axes and starts at an unknown place of it. Else ``se3``: the frames are not the same.
+    On a floor plan as :func:`on_a_plan` says, else ``se3``: the frames are not the same.
     """
-    if rec is None or track is None or rec.channels[track].frame_id != "plan":
-        return "se3"
-    return {"plan": "none", "plan-axes": "origin"}.get(lineage.get("frame", ""), "se3")
+    frame = "" if rec is None or track is None else rec.channels[track].frame_id
+    return on_a_plan(lineage.get("frame", ""), frame) or "se3"
 
 
 def _track_references(rec: Recording, input_topic: str, chosen: str | None) -> tuple[str | None, str | None]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import msgspec
 import numpy as np
 
 from ..algorithms.calibration import Calibration
@@ -16,7 +15,7 @@ from ..algorithms.indoor.lateration import geometry_map
 from ..algorithms.indoor.pathloss import power_dbm
 from ..algorithms.indoor.radio_map import map_of
 from ..recording.errors import UsageError
-from .calibrations import calibrations_of
+from .calibrations import calibrations_of, calibrations_of_runs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -66,20 +65,11 @@ def _context(rec: Recording, calibrations: Sequence[Calibration]) -> Context:
     return Context(
         metadata=rec.metadata,
         attachments={a.name: rec.attachment(a.name) for a in rec.attachments if a.name in names},
-        calibrations={c.kind: c for c in (*calibrations_of(rec.metadata), *_of_runs(rec), *calibrations)},
+        calibrations={
+            c.kind: c
+            for c in (*calibrations_of(rec.metadata), *calibrations_of_runs(rec.metadata), *calibrations)
+        },
     )
-
-
-def _of_runs(rec: Recording) -> list[Calibration]:
-    """Return the calibrations that runs of the recording were given."""
-    texts = {
-        value
-        for name, record in rec.metadata.items()
-        if name.startswith("run/")
-        for key, value in record.items()
-        if key.startswith("calibration.")
-    }
-    return [msgspec.json.decode(text, type=Calibration) for text in sorted(texts)]
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from rerun.blueprint.api import VisualizerLike
 from rerun.encodings import EntityPathLike
 
 from . import top_view
-from .canvas import COMPARE, DETECTOR, OVERVIEW, REPORT, SPACE, TABS, Canvas, Entry, Floats
+from .canvas import COMPARE, DETECTOR, FIGURES, OVERVIEW, REPORT, SPACE, TABS, Canvas, Entry, Floats
 from .shapes import EQUATOR_M, metres_a_degree
 from .timeaxis import SINCE_START
 from .trace import STANDING_M, Trace, framed
@@ -93,6 +93,8 @@ def _tab(name: str, canvases: Sequence[Canvas], entries: Sequence[Entry]) -> rrb
         logs = _panels([e for e in mine if e.kind == "log"], canvases)
         first: list[Part] = [documents[0] if len(documents) == 1 else rrb.Tabs(*documents)]
         return _beside(name, first, logs, [3, 2])
+    if name == FIGURES:
+        return rrb.Tabs(*_panels(mine, canvases), name=name)
     spatial = _panels([e for e in mine if e.kind in SPATIAL], canvases)
     over_time = [e for e in mine if e.kind not in SPATIAL]
     if name == OVERVIEW:
@@ -163,6 +165,8 @@ def _view(entries: Sequence[Entry], canvases: Sequence[Canvas]) -> Part:
         )
     if kind == "space":
         return _space(panel, entries, canvases)
+    if kind == "picture":
+        return rrb.Spatial2DView(origin=entries[0].path, contents=contents, name=panel)
     if kind == "log":
         return rrb.TextLogView(origin="/", contents=contents, name=panel)
     return rrb.TextDocumentView(origin=entries[0].path, contents=contents, name=panel)

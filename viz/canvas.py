@@ -16,6 +16,7 @@ import polars as pl
 import rerun as rr
 from numpy.typing import NDArray
 
+from ..replay.alignment import on_a_plan
 from ..replay.references import shown_reference
 from . import style
 from .floor import FloorPlan
@@ -25,7 +26,7 @@ from .trace import Trace
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
-Kind = Literal["plot", "lanes", "space", "map", "log", "document"]
+Kind = Literal["plot", "lanes", "space", "map", "log", "document", "picture"]
 
 ALIGNMENT = "origin-yaw"
 """Tracks start together and in one direction, so that what is seen (and what sigma speaks of) is the drift
@@ -38,8 +39,8 @@ PLACES = ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PointStamped")
 """Message types that hold positions in metres."""
 
 OVERVIEW, RAW, DETECTOR, ESTIMATES = "Overview", "Raw", "Detector", "Estimates"
-COMPARE, REPORT, JOINTS, RADIO = "Compare", "Report", "Joints", "Radio"
-TABS = (OVERVIEW, RAW, DETECTOR, JOINTS, RADIO, ESTIMATES, COMPARE, REPORT)
+COMPARE, REPORT, JOINTS, RADIO, FIGURES = "Compare", "Report", "Joints", "Radio", "Figures"
+TABS = (OVERVIEW, RAW, DETECTOR, JOINTS, RADIO, FIGURES, ESTIMATES, COMPARE, REPORT)
 """Tabs in their order; a plug-in's own come before the last two."""
 
 SPACE = "track"
@@ -78,7 +79,7 @@ class Entry:
     ----------
     kind : str
         What shows it: ``plot`` (time series), ``lanes`` (states over time), ``space`` (3D), ``map``, ``log``,
-        ``document``.
+        ``document``, ``picture``.
     tab, panel : str
         Name of the tab, and of the panel in it. Entries with the same kind, tab and panel share one.
     owner : str
@@ -212,6 +213,14 @@ class Canvas:
     def reference_of(self, run: str) -> str | None:
         """Return the topic of the positions that a run is compared with, None where there is none."""
         return shown_reference({c.topic: c for c in self.channels}, run, self.metadata)
+
+    def alignment_of(self, run: str, reference: str) -> str:
+        """Return how a run's track is laid upon a reference topic: on a plan it stays where it is."""
+        frames = {c.topic: getattr(c, "frame_id", "") for c in self.channels}
+        frame = self.metadata.get(f"run/{run}", {}).get("frame") or frames.get(
+            f"/estimate/{run}/position", ""
+        )
+        return on_a_plan(frame, frames.get(reference, "")) or self.alignment
 
     # -- what things are called
 

@@ -17,10 +17,10 @@ from ..recording import Recording
 from ..recording.errors import UsageError
 from ..replay.evaluate import evaluate
 from ..replay.references import shown_reference
-from . import indoor_figures, style
+from . import indoor_figures, plan_figures, style
 from .canvas import PLACES, is_estimate
 from .curve import Curve
-from .floor import Anchor, floor_plan, loaders_of
+from .floor import Anchor, plan_of
 from .phone_figures import detector, street_map, transform
 from .shapes import ELLIPSE95, circle, geo_circle, metres_a_degree
 from .stance_figures import conditions
@@ -202,7 +202,7 @@ def _traces(rec: Recording) -> dict[str, Trace]:
 
 def floor(rec: Recording, fig: Figure) -> None:
     """Floor plan with anchors by technology, tracks beside the true path, and 95 % ellipses."""
-    plan, traces = floor_plan(loaders_of(rec)), _traces(rec)
+    plan, traces = plan_of(rec), _traces(rec)
     if not plan and not traces:
         raise UsageError(f"{rec.path}: nothing for this figure: neither plan nor anchors nor tracks")
     fig.set_size_inches(9.0, 7.0)
@@ -239,7 +239,7 @@ def radio(rec: Recording, fig: Figure) -> None:
     """Signal strength by anchor: over time, as histogram, and over the true distance with the model."""
     topic = _require(rec, "radio signals", _topics(rec, ["mac", "rssi_dbm"]))[0]
     table = rec.table(topic)
-    anchors = floor_plan(loaders_of(rec)).anchors
+    anchors = plan_of(rec).anchors
     counts = table.group_by("mac").len().sort("len", "mac", descending=[True, False])["mac"].to_list()
     macs = sorted(counts, key=lambda m: m.lower() not in anchors)[:8]
     truth = next((t for k, t in _traces(rec).items() if role_of(k) == "reference"), None)
@@ -402,6 +402,10 @@ FIGURES: dict[str, Callable[[Recording, Any], None]] = {
     "cycles": cycles,
     "jumps": jumps,
     "strides": strides,
+    "anchors": plan_figures.anchors,
+    "triples": plan_figures.triples,
+    "points": plan_figures.points,
+    "particles": plan_figures.particles,
     "geometry": indoor_figures.geometry,
     "radiomap": indoor_figures.radiomap,
     "ranges": indoor_figures.ranges,

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from typing import Any
 
 import rerun as rr
 
 from ..recording import Recording
+from ..recording.errors import UsageError
 from ..recording.selection import Selection, selected_topics, within
 from ..replay import Evaluation
 from .blueprint import blueprint, extent
-from .canvas import entity
+from .canvas import FIGURES, Canvas, entity
+from .figures import figure
 from .floor import loaders_of
 from .report import measured, report
 from .scene import Scene
@@ -69,6 +72,8 @@ def draw(
         if annotating:
             scene.lanes.show()
         scene.end()
+        if scene.canvas.plan.anchors:
+            draw_figures(scene.canvas, rec)
         metrics = measured(rec)
         send_facts(stream, rec, metrics, prefix)
         text = rr.TextDocument(report(rec, metrics), media_type=rr.MediaType.MARKDOWN)
@@ -78,6 +83,25 @@ def draw(
     log_top_view(stream, *extent(canvases))
     send_blueprint(stream, blueprint(canvases, ruler=annotating))
     return scenes
+
+
+ON_A_PLAN = ("radio", "error", "powers", "radiomap", "geometry")
+"""Figures of a floor that are no curves over time and no lines in space: histograms, powers over distance,
+distributions, maps. The viewer shows them as pictures; live, they come with the saved view."""
+
+
+def draw_figures(canvas: Canvas, rec: Recording) -> None:
+    """Log the figures of a floor as pictures, those for which the recording has something."""
+    for kind in ON_A_PLAN:
+        try:
+            drawn = figure(rec, kind=kind)
+        except UsageError:
+            continue
+        data = io.BytesIO()
+        drawn.savefig(data, format="png", metadata={"Software": None})
+        path = f"{canvas.prefix}/figure/{kind}"
+        canvas.static(path, rr.EncodedImage(contents=data.getvalue(), media_type="image/png"))
+        canvas.show("picture", path, tab=FIGURES, panel=f"{canvas.prefix[1:]} {kind}".strip())
 
 
 OF_THE_WALK = ("truth", "subject")

@@ -18,7 +18,7 @@ import json
 import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -106,6 +106,24 @@ def floor_plan(loaders: Loaders) -> FloorPlan:
         else:
             corners = place
     return FloorPlan(anchors, outlines, picture, corners)
+
+
+def with_calibration(plan: FloorPlan, metadata: Mapping[str, Mapping[str, str]]) -> FloorPlan:
+    """Return the plan whose anchors have what the recording's calibrations, or those of its runs, say of them."""
+    from ..replay.calibrations import calibrations_of, calibrations_of_runs
+
+    anchors = dict(plan.anchors)
+    for one in (*calibrations_of(metadata), *calibrations_of_runs(metadata)):
+        for row in one.values.get("anchors", ()) if one.kind == "radio" else ():
+            mac = str(row["mac"])
+            if mac in anchors and row.get("p_d0") is not None:
+                anchors[mac] = replace(anchors[mac], p_d0=float(row["p_d0"]), eta=float(row["eta"]))
+    return replace(plan, anchors=anchors)
+
+
+def plan_of(rec: Recording) -> FloorPlan:
+    """Return the floor of a recording, its anchors with their calibration."""
+    return with_calibration(floor_plan(loaders_of(rec)), rec.metadata)
 
 
 def tried(loaders: Loaders, name: str, read: Callable[[bytes], Any]) -> Any:

@@ -13,10 +13,10 @@ from ..recording import Recording
 from ..recording.errors import UsageError
 from . import style
 from .canvas import is_estimate
-from .floor import FloorPlan, floor_plan, loaders_of
+from .floor import plan_of
+from .plan_figures import draw_floor, true_positions
 from .shapes import circle
 from .text import printable
-from .trace import Trace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,27 +29,6 @@ BOUND_LIMIT_M = 10.0
 """Bounds above this are drawn as this: there is no position there."""
 
 
-def _plan(ax: Axes, plan: FloorPlan, *, names: bool = True) -> None:
-    """Draw picture, outlines and anchors by technology."""
-    if plan.picture is not None:
-        ax.imshow(plan.picture, extent=plan.corners, alpha=0.6)
-    for line in plan.outlines:
-        ax.plot(line[:, 0], line[:, 1], color="#777777", linewidth=0.8)
-    for i, kind in enumerate(dict.fromkeys(a.technology for a in plan.anchors.values())):
-        positions = np.array([a.position for a in plan.anchors.values() if a.technology == kind])
-        ax.plot(
-            positions[:, 0],
-            positions[:, 1],
-            "s^vPX*"[i % 6],
-            color="black",
-            label=f"anchors {kind}".strip() if names else None,
-        )
-    ax.set_aspect("equal", adjustable="datalim")
-    ax.set_xlabel("x (m)", fontsize=9)
-    ax.set_ylabel("y (m)", fontsize=9)
-    ax.tick_params(labelsize=8)
-
-
 def _title(ax: Axes, text: str) -> None:
     ax.set_title(text, fontsize=10, loc="left")
 
@@ -58,7 +37,7 @@ def geometry(rec: Recording, fig: Figure) -> None:
     """Cramér–Rao bound, dilution and anchors in reach over the plan, and what one more anchor would bring."""
     from ..replay.geometry import REACH_M, geometry_of
 
-    maps, plan = geometry_of(rec), floor_plan(loaders_of(rec))
+    maps, plan = geometry_of(rec), plan_of(rec)
     fig.set_size_inches(13.0, 7.5)
     axes = fig.subplots(2, 2).ravel()
     half = (maps.x[1] - maps.x[0]) / 2
@@ -79,7 +58,7 @@ def geometry(rec: Recording, fig: Figure) -> None:
         clipped = np.where(np.isnan(values), np.nan, np.minimum(values, top))
         picture = ax.imshow(clipped.T, origin="lower", extent=extent, cmap="viridis", vmin=0.0, vmax=top)
         fig.colorbar(picture, ax=ax, label=unit, shrink=0.8)
-        _plan(ax, plan, names=False)
+        draw_floor(ax, plan, names=False)
         _title(ax, title)
     axes[3].plot(*maps.extra, "*", color="red", markersize=14)
 
@@ -88,7 +67,7 @@ def radiomap(rec: Recording, fig: Figure) -> None:
     """Expected power of the anchors over the plan: the survey's radio map, else the log-distance models."""
     from ..replay.geometry import power_map_of
 
-    power_map, plan = power_map_of(rec), floor_plan(loaders_of(rec))
+    power_map, plan = power_map_of(rec), plan_of(rec)
     shown = list(range(min(len(power_map.anchors), MOST_ANCHORS)))
     rows = (len(shown) + 2) // 3
     fig.set_size_inches(13.0, 3.4 * rows)
@@ -100,7 +79,7 @@ def radiomap(rec: Recording, fig: Figure) -> None:
             power_map.mean_dbm[k].T, origin="lower", extent=extent, cmap="magma", vmin=low, vmax=high
         )
         fig.colorbar(picture, ax=ax, label="dBm", shrink=0.7)
-        _plan(ax, plan, names=False)
+        draw_floor(ax, plan, names=False)
         ax.plot(*power_map.anchors.plane[k], "*", color="cyan", markersize=11)
         kind = "surveyed" if power_map.surveyed else f"η {power_map.anchors.eta[k]:.2f}"
         _title(ax, f"{power_map.anchors.technology[k]} {printable(power_map.anchors.macs[k])}, {kind}")
@@ -119,7 +98,7 @@ def ranges(rec: Recording, fig: Figure) -> None:
         raise UsageError(
             f"{rec.path}: nothing for this figure: no run with ranges (indoor.trilateration, indoor.hybrid)"
         )
-    plan, run = floor_plan(loaders_of(rec)), runs[0]
+    plan, run = plan_of(rec), runs[0]
     before, after = rec.table(f"{run}/ranges"), rec.table(f"{run}/corrected")
     joined = before.join(after, on=["t_ns", "mac"], suffix="_after")
     changed = joined.group_by("t_ns").agg(
@@ -129,14 +108,14 @@ def ranges(rec: Recording, fig: Figure) -> None:
     fig.set_size_inches(13.0, 5.5)
     fixes = rec.table(f"{run}/position") if f"{run}/position" in rec.channels else None
     fix = fixes.filter(pl.col("t_ns") == t_ns) if fixes is not None else None
-    truth = _truth(rec)
+    truth = true_positions(rec)
     for ax, table, title in zip(
         fig.subplots(1, 2),
         (before, after),
         ("before the correction", "after the correction by vote"),
         strict=True,
     ):
-        _plan(ax, plan)
+        draw_floor(ax, plan)
         rows = table.filter(pl.col("t_ns") == t_ns)
         for i, (mac, distance) in enumerate(rows.select("mac", "distance_m").iter_rows()):
             anchor = plan.anchors.get(mac)
@@ -158,17 +137,6 @@ def ranges(rec: Recording, fig: Figure) -> None:
         ax.legend(fontsize=7, loc="upper right")
 
 
-def _truth(rec: Recording) -> Trace | None:
-    for topic in ("/reference/pose", "/reference/position"):
-        if topic in rec.channels and rec.channels[topic].count:
-            table = rec.table(topic)
-            trace = Trace(topic, style.REFERENCE)
-            position = table.select(pl.col("pos_x", "pos_y"), pl.col("pos_z").fill_nan(0.0)).to_numpy()
-            trace.add(table["t_ns"].to_numpy(), position, None)
-            return trace
-    return None
-
-
 def powers(rec: Recording, fig: Figure) -> None:
     """Received power over distance: means with the fitted models and other exponents, histograms by distance."""
     from ..replay import calibrate
@@ -181,9 +149,9 @@ def powers(rec: Recording, fig: Figure) -> None:
     fitted = [a for a in models if a.get("p_d0") is not None][:MOST_ANCHORS]
     if not fitted:
         raise UsageError(f"{rec.path}: nothing for this figure: no anchor with powers at four distances")
-    anchors = floor_plan(loaders_of(rec)).anchors
+    anchors = plan_of(rec).anchors
     topic = next(t for t, c in rec.channels.items() if c.schema == RADIO and c.count and not is_estimate(t))
-    table, truth = rec.table(topic), _truth(rec)
+    table, truth = rec.table(topic), true_positions(rec)
     assert truth is not None  # the calibration found positions
     fig.set_size_inches(12.0, 3.2 * len(fitted))
     axes = fig.subplots(len(fitted), 2, squeeze=False)

@@ -129,7 +129,9 @@ class Scene:
             _, mark, rest = path.partition("/run/")
             topic = canvas.reference_of(rest.split("/")[0]) if mark else None
             reference = canvas.traces.get(canvas.base(topic)) if topic is not None else None
-            comparison = compared(trace, reference, canvas.alignment) if reference is not None else None
+            if topic is None or reference is None:
+                continue
+            comparison = compared(trace, reference, canvas.alignment_of(rest.split("/")[0], topic))
             if comparison is None:
                 continue
             far = distance(comparison)

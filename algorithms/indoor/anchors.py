@@ -21,6 +21,10 @@ from ..contract import AlgorithmError, Context, FloatArray, Remark
 
 ATTACHMENT = "anchors.csv"
 COLUMNS = ("mac", "technology", "x", "y", "z", "p_d0", "eta", "name")
+MIDDLE_M = 5.0
+"""A usual distance to an anchor: there the power is known best, and errors of P_d0 and η go together."""
+LEAST_ETA = 0.3
+"""An exponent below this is no model: a range would grow tenfold with 3 dB."""
 USUAL_SIGMA_DB = 6.0
 """Standard deviation of one received power about the model, where nothing was measured (Rappaport 2002, table 4.6)."""
 
@@ -45,6 +49,8 @@ class Anchors:
         What a user must know of them.
     borrowed : ndarray
         Whether the parameters are pooled ones, shape (n,).
+    covariance : ndarray
+        Of (P_d0, η) as far as it is known, shape (n, 2, 2); NaN where it is not.
     """
 
     macs: list[str]
@@ -55,6 +61,7 @@ class Anchors:
     sigma_db: FloatArray
     remarks: list[Remark] = field(default_factory=list)
     borrowed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 2)))
     number: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -72,6 +79,19 @@ class Anchors:
         """Return how far each anchor is above a receiver at ``height_m``, 0 where its height is not known."""
         up = self.position[:, 2] - height_m
         return np.where(np.isnan(up), 0.0, up)
+
+    def doubt(self, power_db: float, eta: float) -> FloatArray:
+        """Return the covariance of (P_d0, η), shape (n, 2, 2).
+
+        Where none is stated, anchors with values of their own have none, those with pooled ones an independent
+        doubt of the power at :data:`MIDDLE_M` and of η.
+        """
+        lever = 10.0 * math.log10(MIDDLE_M)
+        turn = np.array([[1.0, lever], [0.0, 1.0]])
+        assumed = turn @ np.diag([power_db**2, eta**2]) @ turn.T
+        stated = np.isfinite(self.covariance.sum(axis=(1, 2)))
+        own = np.where(self.borrowed[:, None, None], assumed, 0.0)
+        return np.where(stated[:, None, None], np.nan_to_num(self.covariance), own)
 
     @property
     def relative_sigma(self) -> FloatArray:
@@ -148,13 +168,25 @@ def anchors_of(context: Context, *, without: str = "", need_model: bool = True) 
         raise AlgorithmError(f"without: no anchor {min(unknown)!r}; there are {_names(rows)}")
     rows = [r for r in rows if r["mac"] not in out and r["name"].lower() not in out]
     remarks: list[Remark] = []
+    flat: list[str] = []
     offset = float(values.get("offsets_db", {}).get(device_of(context.metadata), 0.0))
     for row in rows:
         mine = measured.get(row["mac"])
-        row["sigma_db"], row["borrowed"] = math.nan, False
+        row["sigma_db"], row["borrowed"], row["covariance"] = math.nan, False, np.full((2, 2), np.nan)
         if mine is not None:
+            if mine.get("eta") is not None and float(mine["eta"]) < LEAST_ETA:
+                flat.append(row["name"] or row["mac"])
+                mine = {k: v for k, v in mine.items() if k not in ("p_d0", "eta", "sigma_db")}
+                row["p_d0"] = row["eta"] = math.nan
             row |= {k: float(mine[k]) for k in ("p_d0", "eta", "sigma_db") if mine.get(k) is not None}
+            if "p_d0" in mine and "covariance" in mine:
+                row["covariance"] = np.array(mine["covariance"], dtype=np.float64)
             row["p_d0"] += offset
+    if flat:
+        detail = f"η below {LEAST_ETA:g} of {', '.join(flat[:4])}: powers that do not fall with distance give no ranges"
+        remarks.append(
+            Remark("flat_anchors", f"{detail}; pooled values are taken, calibrate at other distances")
+        )
     pooled = _pooled(rows, values, offset)
     borrowed: dict[str, list[str]] = {}
     for row in rows:
@@ -166,6 +198,8 @@ def anchors_of(context: Context, *, without: str = "", need_model: bool = True) 
                     "marcha calibrate radio, or write p_d0 (dBm at 1 m) and eta into the anchor table"
                 )
             row["p_d0"], row["eta"] = common[:2] if common else (math.nan, math.nan)
+            if prior := spread_of(values, row["technology"]):
+                row["covariance"] = prior[1]
             row["borrowed"] = True
             borrowed.setdefault(row["technology"], []).append(row["name"] or row["mac"])
         if math.isnan(row["sigma_db"]):
@@ -195,7 +229,16 @@ def anchors_of(context: Context, *, without: str = "", need_model: bool = True) 
         column("sigma_db"),
         remarks,
         np.array([r["borrowed"] for r in rows], dtype=bool),
+        np.array([r["covariance"] for r in rows]).reshape(-1, 2, 2),
     )
+
+
+def spread_of(values: Mapping[str, Any], technology: str) -> tuple[FloatArray, FloatArray] | None:
+    """Return mean (2,) and covariance (2, 2) of (P_d0, η) over the anchors; None where too few are calibrated."""
+    found = dict(values.get("pooled", {})).get(technology, {})
+    if "between" not in found:
+        return None
+    return np.array(found["mean"], dtype=np.float64), np.array(found["between"], dtype=np.float64)
 
 
 def _pooled(

@@ -16,6 +16,8 @@ from .anchors import ATTACHMENT, device_of, parse_anchors
 from .pathloss import PathLoss, calibrate_by_distances, power_dbm, regress, trimmed_mean
 from .places import Place, coverage
 
+FEW_ANCHORS = 4
+"""Fewer anchors do not say what the anchors of a technology differ by."""
 XYZ = ("pos_x", "pos_y", "pos_z")
 ROUNDS = 20
 """Of models and receivers' offsets in turn; each settles the offsets to a tenth of what was left."""
@@ -136,7 +138,7 @@ class RadioCalibration(Calibrator):
         remarks: list[str] = []
         measured = {m: means for m, means in points.items() if m in anchors}
         offsets = self._offsets(anchors, measured)
-        pooled: dict[str, dict[str, float]] = {}
+        pooled: dict[str, dict[str, Any]] = {}
         for technology in sorted({anchors[m]["technology"] for m in measured}):
             mine = [m for m in measured if anchors[m]["technology"] == technology]
             try:
@@ -159,6 +161,12 @@ class RadioCalibration(Calibrator):
                     remarks.append(f"anchor {row['name'] or mac}: {error}")
             one["points"] = [[*map(float, p.where), p.power - offsets.get(p.device, 0.0)] for p in means]
             out.append(one)
+        for technology, values in pooled.items():
+            fits = np.array(
+                [(a["p_d0"], a["eta"]) for a in out if a["technology"] == technology and "p_d0" in a]
+            )
+            if len(fits) >= FEW_ANCHORS:
+                values["mean"], values["between"] = fits.mean(axis=0).tolist(), np.cov(fits.T).tolist()
         own = sum("p_d0" in a for a in out)
         if not anchors:
             remarks.append("no anchor table: a radio map of fingerprints only, no ranges")
@@ -233,20 +241,22 @@ class RadioCalibration(Calibrator):
 
     def _fit(
         self, parts: Sequence[tuple[dict[str, Any], list[_Mean]]], offsets: dict[str, float]
-    ) -> tuple[dict[str, float], str]:
+    ) -> tuple[dict[str, Any], str]:
         """Return the model's values of anchors taken together, and what is doubtful about it."""
         d = np.concatenate([self._distances(anchor, means_of) for anchor, means_of in parts])
         means = [p for _, means_of in parts for p in means_of]
         powers = np.array([p.power - offsets.get(p.device, 0.0) for p in means])
         model = self._model(d, powers)
         within = float(np.sqrt(np.mean(np.square([p.sd for p in means]))))
-        values = {
+        values: dict[str, Any] = {
             "p_d0": model.p_d0_dbm,
             "eta": model.eta,
             "residual_db": model.residual_db,
             "within_db": within,
             "sigma_db": float(np.hypot(model.residual_db, within)),
         }
+        if model.covariance is not None and np.isfinite(model.covariance).all():
+            values["covariance"] = model.covariance.tolist()
         return values, model.doubt
 
     def _model(self, d: FloatArray, p: FloatArray) -> PathLoss:

@@ -9,15 +9,34 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from ..contract import AlgorithmError, Context, FloatArray, Input, KernelEstimator, Remark
+from ..contract import AlgorithmError, Context, FloatArray, Input, KernelEstimator, Output, Remark
 from ..parameters import meta
-from .anchors import Anchors, anchors_of
+from .anchors import Anchors, anchors_of, device_of
 from .floorplan import raster_of
-from .particles import COLUMNS, SETTINGS, Cloud, run, scatter
+from .lateration import flatness
+from .particles import (
+    COLUMNS,
+    D_ETA,
+    D_POWER,
+    ERRORS,
+    GAIN,
+    LOGW,
+    SETTINGS,
+    SHOWN,
+    V_ETA,
+    Cloud,
+    run,
+    scatter,
+)
 from .pdr import ORIENTATION, plan_frame
 from .radio_map import RadioMap, map_of
 from .steps import make_state
 from .trilateration import POSITION, RANGES, SIGMA
+
+STRANGE_DB = 4.0
+"""What receivers differ by (standard deviation)."""
+ON_A_LINE = 0.01
+"""Anchors flatter than this are on a line."""
 
 
 class IndoorFusedParams(msgspec.Struct, frozen=True, kw_only=True):
@@ -35,12 +54,29 @@ class IndoorFusedParams(msgspec.Struct, frozen=True, kw_only=True):
     correlation_m: Annotated[
         float, meta("distance over which shadowing stays", "m", "Gudmundson 1991", gt=0)
     ] = 4.0
-    pooled_db: Annotated[float, meta("further slow error of anchors without calibration", "dB", "", ge=0)] = (
-        4.0
-    )
+    pooled_db: Annotated[
+        float,
+        meta(
+            "doubt of the power at 5 m of anchors without values of their own, where a calibration does not state what "
+            "its anchors differ by; learned on the way",
+            "dB",
+            "Rappaport 2002, table 4.6",
+            ge=0,
+        ),
+    ] = 4.0
+    pooled_eta: Annotated[
+        float, meta("the same of η; learned on the way", "1", "hybrid indoor positioning, table 5.1", ge=0)
+    ] = 0.4
     offset_db: Annotated[
-        float, meta("offset of this receiver against the calibrated one; learned on the way", "dB", "", ge=0)
-    ] = 0.0
+        float,
+        meta(
+            "doubt of the offset of this receiver (or tag) to the calibrated ones; learned on the way; −1: 4 where "
+            "a calibration does not know it, else 0",
+            "dB",
+            "Lui et al. 2011",
+            ge=-1,
+        ),
+    ] = -1.0
     freedom: Annotated[float, meta("degrees of freedom of Student's t", "", "Lange et al. 1989", gt=0)] = 4.0
     range_sd_m: Annotated[float, meta("of ranges that are measured as such", "m", "", gt=0)] = 0.3
     speed: Annotated[
@@ -83,6 +119,11 @@ class IndoorFusedParams(msgspec.Struct, frozen=True, kw_only=True):
     without: Annotated[str, meta("anchors left out, by address or name", "")] = ""
 
 
+PARTICLES = Output(
+    "particles", "marcha_msgs/msg/NamedValues", ("particle_x", "particle_y"), event=True, frame="plan"
+)
+
+
 class IndoorFused(KernelEstimator):
     """Rao–Blackwellised particle filter over powers, ranges and steps; see :mod:`.particles`."""
 
@@ -102,7 +143,8 @@ class IndoorFused(KernelEstimator):
         Input("imu", "sensor_msgs/msg/Imu", ("acc_x", "acc_y", "acc_z"), optional=True, regular=True),
         ORIENTATION,
     )
-    outputs = (POSITION, SIGMA)
+    outputs = (POSITION, SIGMA, PARTICLES)
+    max_results = 1 + SHOWN
     run = staticmethod(run)
     state: Any
 
@@ -131,8 +173,16 @@ class IndoorFused(KernelEstimator):
         north = plan_frame(context, p.x_axis_azimuth_deg)[2]  # without it headings are taken as the plan's
         self.from_east = bool(steps) and steps[0].frame_id != "plan" and north
         calibration = context.calibrations.get("radio")
+        strange = (
+            calibration is not None and device_of(context.metadata) not in calibration.values["offsets_db"]
+        )
+        self.offset_db = p.offset_db if p.offset_db >= 0 else STRANGE_DB if strange else 0.0
+        self.unknown: set[str] = set()
+        self.heard: set[int] = set()
         height = p.height_m or (float(calibration.values.get("height_m", 1.2)) if calibration else 1.2)
         radio_map = map_of(context, anchors, height) if p.use_map else None
+        # a mirror image, or a ring about one anchor, is told apart by these alone
+        self.sided = p.known_start or radio_map is not None or raster is not None or (stepped and north)
         self.state = self.cloud(context, anchors, radio_map, raster, height, stepped)
 
     def cloud(
@@ -191,14 +241,17 @@ class IndoorFused(KernelEstimator):
         for key, value in values.items():
             one[key] = value
         n, k = p.particles, len(anchors)
-        table = np.zeros((k, 7))
+        table = np.zeros((k, 11))
         table[:, :2], table[:, 2] = anchors.plane, anchors.above(height)
         table[:, 3], table[:, 4] = anchors.p_d0, anchors.eta
-        table[:, 5] = np.where(anchors.borrowed, math.hypot(p.slow_db, p.pooled_db), p.slow_db)
-        table[:, 6] = np.where(anchors.borrowed, 3 * p.correlation_m, p.correlation_m)
+        table[:, 5], table[:, 6] = p.slow_db, p.correlation_m
+        doubt = anchors.doubt(p.pooled_db, p.pooled_eta)
+        table[:, 7], table[:, 8], table[:, 9] = doubt[:, 0, 0], doubt[:, 1, 1], doubt[:, 0, 1]
         mean = sd = np.zeros((0, 2, 2))
         if radio_map is not None:
             mean, sd = radio_map.mean, radio_map.sd
+            table[:, 10] = radio_map.known
+            table[radio_map.known, 7:10] = 0.0  # the map's own doubt has them
             one["map_low"], one["map_cell"] = radio_map.low, radio_map.cell
         walk = make_state(threshold=p.threshold, least_s=0.15, most_s=0.4, gravity_s=0.08, along_gravity=True)
         cloud = Cloud(
@@ -206,8 +259,8 @@ class IndoorFused(KernelEstimator):
             walk,
             np.zeros((n, COLUMNS)),
             np.zeros((n, COLUMNS)),
-            np.zeros((n, k, 3)),
-            np.zeros((n, k, 3)),
+            np.zeros((n, k, ERRORS)),
+            np.zeros((n, k, ERRORS)),
             table,
             mean,
             sd,
@@ -215,7 +268,7 @@ class IndoorFused(KernelEstimator):
         )
         x = p.start_x if p.known_start else math.nan
         offset = math.radians(p.heading_sd_deg)
-        scatter(cloud, x, p.start_y, p.start_sd_m, offset, p.scale_sd, p.offset_db)
+        scatter(cloud, x, p.start_y, p.start_sd_m, offset, p.scale_sd, self.offset_db)
         return cloud
 
     def encode(self, index: int, channel: int, table: pl.DataFrame) -> FloatArray:
@@ -231,9 +284,12 @@ class IndoorFused(KernelEstimator):
                 values[:, 1] = -turned if one["mirrored"] else turned
             return values
         number = self.anchors.number
+        macs = table["mac"].to_list()
         out = np.empty((table.height, 2))
-        out[:, 0] = [number.get(mac, -1) for mac in table["mac"].to_list()]
+        out[:, 0] = [number.get(mac, -1) for mac in macs]
         out[:, 1] = table[self.inputs[index].columns[1]].to_numpy()
+        self.unknown.update(mac for mac in set(macs) if mac not in number)
+        self.heard.update(np.unique(out[np.isfinite(out[:, 1]), 0]).astype(int).tolist())
         return out
 
     def snapshot(self) -> Any:
@@ -249,12 +305,67 @@ class IndoorFused(KernelEstimator):
         """Say what a user must know of the run."""
         s = self.state.s[0]
         remarks = [*self.start_remarks, *self.anchors.remarks]
-        if s["received"] == 0 and s["steps"] == 0:
+        if s["received"] == 0 and len(self.anchors):
+            alone = bool(s["known_start"]) and s["steps"] > 0
+            detail = (
+                "no power of a known anchor: dead reckoning only"
+                if alone
+                else ("no power of a known anchor: no position; check anchors.csv")
+            )
+            remarks.append(Remark("nothing_heard", detail, not alone))
+        elif s["received"] == 0 and s["steps"] == 0:
+            remarks.append(Remark("nothing_heard", "no step: no position", True))
+        if self.unknown and len(self.anchors):
+            some = ", ".join(sorted(self.unknown)[:3])
             remarks.append(
                 Remark(
-                    "nothing_heard",
-                    "no power of a known anchor and no step: no position; check anchors.csv",
-                    True,
+                    "unknown_anchor",
+                    f"{len(self.unknown)} addresses are in no anchor table: {some}; left out",
+                )
+            )
+        return remarks + self._geometry() + self._learned()
+
+    def _geometry(self) -> list[Remark]:
+        """Say that the anchors heard do not tell where one is: too few, or on a line."""
+        heard = sorted(self.heard - {-1})
+        if not heard or (len(heard) >= 3 and flatness(self.anchors.plane[heard]) >= ON_A_LINE):
+            return []
+        kind, what = (
+            ("too_few_anchors", f"{len(heard)} anchors were heard")
+            if len(heard) < 3
+            else ("collinear_anchors", f"the {len(heard)} anchors heard are on a line")
+        )
+        detail = f"{what}: a position and its mirror image fit alike; add an anchor beside them"
+        if self.sided:
+            detail = f"{what}: only start, steps, walls or a radio map tell the sides apart; look at the stated sigma"
+        return [Remark(kind, detail, not self.sided)]
+
+    def _learned(self) -> list[Remark]:
+        """Say what P_d0, η and the receiver's offset were learned to be."""
+        if self.state.s[0]["received"] == 0:
+            return []
+        weight = np.exp(self.state.p[:, LOGW])
+        weight /= weight.sum()
+        remarks: list[Remark] = []
+        doubted = np.flatnonzero(self.anchors.borrowed & (self.state.a[:, 8] > 0))
+        told = [k for k in doubted.tolist() if k in self.heard]
+        words: list[str] = []
+        for k in told:
+            b = self.state.b[:, k]
+            power, eta = weight @ b[:, D_POWER], weight @ b[:, D_ETA]
+            sd = math.sqrt(weight @ (b[:, V_ETA] + (b[:, D_ETA] - eta) ** 2))
+            values = self.anchors.p_d0[k] + power, self.anchors.eta[k] + eta
+            words.append(f"{self.anchors.macs[k]} {values[0]:.1f} dBm, η {values[1]:.2f} ± {sd:.2f}")
+        if words:
+            more = " …" if len(words) > 4 else ""
+            remarks.append(Remark("learned_anchors", f"learned on the way: {'; '.join(words[:4])}{more}"))
+        if self.offset_db > 0:
+            gain = self.state.p[:, GAIN]
+            mean = float(weight @ gain)
+            sd = math.sqrt(weight @ (gain - mean) ** 2)
+            remarks.append(
+                Remark(
+                    "learned_offset", f"this receiver hears {mean:+.1f} ± {sd:.1f} dB against the calibrated"
                 )
             )
         return remarks

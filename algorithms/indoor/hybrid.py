@@ -81,9 +81,9 @@ class IndoorHybrid(PlainEstimator):
         results: list[Result] = []
         closed = self.windows.close(message.t_ns)
         if closed is not None:
-            results += ranging_results(self.windows, closed)
             self.variance += self.params.q
             fix = self.windows.fix(closed)
+            results += ranging_results(self.windows, closed)
             if fix is not None:
                 self.update(fix[0])
             results += self.answer(closed.end_ns)

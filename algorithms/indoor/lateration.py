@@ -51,8 +51,8 @@ def flatness(anchors: ArrayLike) -> float:
     return float(extent[1] / extent[0]) if extent[0] > 0 else 0.0
 
 
-def mean_of_triples(anchors: ArrayLike, ranges: ArrayLike, *, least_flatness: float = 0.01) -> FloatArray:
-    """Return the mean of the solutions of all triples (eq 4.6), NaN where every triple is on a line.
+def triples(anchors: ArrayLike, ranges: ArrayLike, *, least_flatness: float = 0.01) -> FloatArray:
+    """Return the solution of each three anchors, shape (m, 2), m, without those on a line.
 
     Parameters
     ----------
@@ -69,7 +69,13 @@ def mean_of_triples(anchors: ArrayLike, ranges: ArrayLike, *, least_flatness: fl
         for three in combinations(range(len(d)), 3)
         if flatness(a[list(three)]) >= least_flatness
     ]
-    return np.mean(positions, axis=0) if positions else np.full(2, np.nan)
+    return np.array(positions).reshape(-1, 2)
+
+
+def mean_of_triples(anchors: ArrayLike, ranges: ArrayLike, *, least_flatness: float = 0.01) -> FloatArray:
+    """Return the mean of the :func:`triples` (eq 4.6), NaN where every triple is on a line."""
+    found = triples(anchors, ranges, least_flatness=least_flatness)
+    return found.mean(axis=0) if len(found) else np.full(2, np.nan)
 
 
 def votes(anchors: ArrayLike, ranges: ArrayLike, *, both: bool = False) -> FloatArray:

@@ -1,9 +1,10 @@
 """The particle filter behind ``indoor.fused``: each power as it comes, steps, walls; one compiled kernel.
 
 A particle is a position, a velocity, an offset of the heading, a scale of the step and an offset of the receiver.
-Given its path the slow errors of the powers (shadowing, by anchor) are linear and Gaussian, so that each particle
-carries one scalar Kalman filter an anchor (Rao–Blackwellised particle filter, Doucet et al. 2000; Gauss–Markov
-shadowing by distance walked, Gudmundson 1991). Fast fading is Student's t (robust to blocked paths).
+Given its path the slow errors of the powers are linear and Gaussian, so that each particle carries one Kalman filter an
+anchor of three states: shadowing that is forgotten with the distance walked (Gauss–Markov, Gudmundson 1991), and what
+the anchor's P_d0 and η differ from their expected values, which stay (Rao–Blackwellised particle filter, Doucet et al.
+2000). Fast fading is Student's t (robust to blocked paths).
 """
 
 from __future__ import annotations
@@ -21,6 +22,28 @@ from .steps import take_acceleration
 X, Y, VX, VY, OFFSET, SCALE, GAIN, PATH, LOGW, COLUMNS = range(10)
 """Columns of a particle; PATH is the distance that it has walked (m), GAIN the receiver's offset (dB)."""
 
+(
+    PATH_AT,
+    SHADOW,
+    SHADOW_VARIANCE,
+    D_POWER,
+    D_ETA,
+    V_POWER,
+    V_ETA,
+    C_SHADOW_POWER,
+    C_SHADOW_ETA,
+    C_POWER_ETA,
+    ERRORS,
+) = range(11)
+"""Slow errors of an anchor's power in a particle: distance walked at its last power (m); shadowing (dB), its variance;
+what P_d0 (dB) and η differ from their expected values, their variances; covariances."""
+UNHEARD_M = -1e9
+"""Distance walked at the last power where there was none: all of the shadowing is forgotten by then."""
+
+SHOWN, SHOWN_NS = 60, 1_000_000_000
+"""So many particles, drawn by their weights, are handed out each so often: to be seen."""
+WIDTH = 8
+"""Columns of a result: position, three sigmas, and the place of one particle."""
 QUIET_NS = 50_000_000
 """A position is stated this long after the last one also where no power and no step came."""
 
@@ -33,6 +56,7 @@ SETTINGS = np.dtype(
         ("own_steps", "i8"),  # whether steps are detected here, not given
         ("known_start", "i8"),
         ("told_ns", "i8"),  # time of the newest result
+        ("shown_ns", "i8"),  # time of the newest particles that were handed out
         ("x_axis", "f8"),
         ("mirrored", "i8"),
         ("low", "f8", 2),
@@ -70,10 +94,11 @@ class Cloud(NamedTuple):
         The step detector.
     p, p2 : ndarray (n, COLUMNS)
         Particles, and room for resampling.
-    b, b2 : ndarray (n, anchors, 3)
-        Slow error of each anchor's power: mean, variance (dB), distance walked at its last power.
-    a : ndarray (anchors, 7)
-        x, y, height above the receiver, P_d0, η, standard deviation (dB) and length (m) of the slow error.
+    b, b2 : ndarray (n, anchors, ERRORS)
+        Slow errors of each anchor's power.
+    a : ndarray (anchors, 11)
+        x, y, height above the receiver, P_d0, η, standard deviation (dB) and length (m) of the shadowing, variances
+        of P_d0 and η and their covariance, 1 where the radio map has the anchor.
     mean, sd : ndarray (anchors or 0, nx, ny)
         Radio map.
     open : uint8 ndarray (nx, ny)
@@ -162,9 +187,10 @@ def scatter(c: Any, x: float, y: float, sd: float, offset_sd: float, scale_sd: f
         p[PATH] = 0.0
         p[LOGW] = 0.0
         for k in range(c.a.shape[0]):
-            c.b[i, k, 0] = 0.0
-            c.b[i, k, 1] = c.a[k, 5] ** 2
-            c.b[i, k, 2] = 0.0
+            b = c.b[i, k]
+            b[:] = 0.0
+            b[PATH_AT] = UNHEARD_M
+            b[V_POWER], b[V_ETA], b[C_POWER_ETA] = c.a[k, 7], c.a[k, 8], c.a[k, 9]
 
 
 @compiled
@@ -229,15 +255,16 @@ def _step(c: Any, length: float, heading: float) -> None:
 
 @compiled
 def _power(c: Any, k: int, rssi: float) -> None:
-    """Weigh the particles by a power of anchor ``k``, and update its slow error in each."""
+    """Weigh the particles by a power of anchor ``k``, and update its slow errors in each."""
     s = c.s[0]
     s.received += 1
     fast2 = s.fast * s.fast
-    mapped = c.mean.shape[0] > 0
+    mapped = c.a[k, 10] > 0.0
     for i in range(c.p.shape[0]):
         p = c.p[i]
         b = c.b[i, k]
         slow2 = c.a[k, 5] ** 2
+        log10d = 0.0
         if mapped:
             fx = (p[X] - s.map_low[0]) / s.map_cell
             fy = (p[Y] - s.map_low[1]) / s.map_cell
@@ -251,20 +278,35 @@ def _power(c: Any, k: int, rssi: float) -> None:
             slow2 = c.sd[k, m, n] ** 2
         else:
             dx, dy, dz = p[X] - c.a[k, 0], p[Y] - c.a[k, 1], c.a[k, 2]
-            square = max(dx * dx + dy * dy + dz * dz, 0.09)
-            expected = c.a[k, 3] - 5.0 * c.a[k, 4] * math.log10(square)
-        keep = math.exp(-(p[PATH] - b[2]) / c.a[k, 6])
-        b[2] = p[PATH]
-        b[0] *= keep
-        b[1] = keep * keep * b[1] + (1.0 - keep * keep) * slow2
-        variance = b[1] + fast2
-        e = rssi - expected - p[GAIN] - b[0]
+            log10d = 0.5 * math.log10(max(dx * dx + dy * dy + dz * dz, 0.09))
+            expected = c.a[k, 3] - 10.0 * c.a[k, 4] * log10d
+        keep = math.exp(-(p[PATH] - b[PATH_AT]) / c.a[k, 6])
+        b[PATH_AT] = p[PATH]
+        b[SHADOW] *= keep
+        b[SHADOW_VARIANCE] = keep * keep * b[SHADOW_VARIANCE] + (1.0 - keep * keep) * slow2
+        b[C_SHADOW_POWER] *= keep
+        b[C_SHADOW_ETA] *= keep
+        # the power's own row: 1 of the shadowing, 1 of P_d0, h of η
+        h = -10.0 * log10d
+        ph_shadow = b[SHADOW_VARIANCE] + b[C_SHADOW_POWER] + h * b[C_SHADOW_ETA]
+        ph_power = b[C_SHADOW_POWER] + b[V_POWER] + h * b[C_POWER_ETA]
+        ph_eta = b[C_SHADOW_ETA] + b[C_POWER_ETA] + h * b[V_ETA]
+        slow = ph_shadow + ph_power + h * ph_eta
+        variance = slow + fast2
+        e = rssi - expected - p[GAIN] - b[SHADOW] - b[D_POWER] - h * b[D_ETA]
         nu = s.freedom
         p[LOGW] -= 0.5 * math.log(variance) + 0.5 * (nu + 1.0) * math.log(1.0 + e * e / (nu * variance))
         trust = min((nu + 1.0) / (nu + e * e / variance), 1.0)
-        gain = b[1] / (b[1] + fast2 / trust)
-        b[0] += gain * e
-        b[1] *= 1.0 - gain
+        gain = 1.0 / (slow + fast2 / trust)
+        b[SHADOW] += gain * ph_shadow * e
+        b[D_POWER] += gain * ph_power * e
+        b[D_ETA] += gain * ph_eta * e
+        b[SHADOW_VARIANCE] -= gain * ph_shadow * ph_shadow
+        b[V_POWER] -= gain * ph_power * ph_power
+        b[V_ETA] -= gain * ph_eta * ph_eta
+        b[C_SHADOW_POWER] -= gain * ph_shadow * ph_power
+        b[C_SHADOW_ETA] -= gain * ph_shadow * ph_eta
+        b[C_POWER_ETA] -= gain * ph_power * ph_eta
 
 
 @compiled
@@ -324,15 +366,33 @@ def _resample(c: Any) -> None:
         for k in range(COLUMNS):
             c.p2[i, k] = c.p[j, k]
         for k in range(anchors):
-            for m in range(3):
+            for m in range(ERRORS):
                 c.b2[i, k, m] = c.b[j, k, m]
     for i in range(n):
         for k in range(COLUMNS):
             c.p[i, k] = c.p2[i, k]
         c.p[i, LOGW] = 0.0
         for k in range(anchors):
-            for m in range(3):
+            for m in range(ERRORS):
                 c.b[i, k, m] = c.b2[i, k, m]
+
+
+@compiled
+def _show(c: Any, out_values: FloatArray, count: int) -> None:
+    """Fill rows from ``count`` on with the places of particles: systematic sampling, without random numbers."""
+    n = c.p.shape[0]
+    total = 0.0
+    for i in range(n):
+        total += math.exp(c.p[i, LOGW])
+    j, reached = 0, math.exp(c.p[0, LOGW]) / total
+    for i in range(SHOWN):
+        while reached < (i + 0.5) / SHOWN and j < n - 1:
+            j += 1
+            reached += math.exp(c.p[j, LOGW]) / total
+        out = out_values[count + i]
+        for k in range(out.size):
+            out[k] = math.nan
+        out[6], out[7] = c.p[j, X], c.p[j, Y]
 
 
 @compiled
@@ -400,4 +460,11 @@ def run(
             out_message[count] = m
             out_t_ns[count] = t_ns[m]
             count += 1
+            if out_values.shape[1] == WIDTH and t_ns[m] - s.shown_ns >= SHOWN_NS:
+                s.shown_ns = t_ns[m]
+                _show(c, out_values, count)
+                for _ in range(SHOWN):
+                    out_message[count] = m
+                    out_t_ns[count] = t_ns[m]
+                    count += 1
     return count

@@ -12,11 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..contract import Context, FloatArray
-from .anchors import Anchors
-from .pathloss import power_dbm
+from .anchors import Anchors, device_of, spread_of
 
 LENGTH_M = 8.0
 """Distance over which a deviation from the model is felt; rooms, not centimetres."""
+LEAST_POINTS = 3
+"""Points that an anchor needs for a map."""
+WEAK = np.array([[149.0, 7.0], [7.0, 1.0]])
+"""Covariance of (P_d0, η) where a calibration does not say what anchors differ by: 10 dB at 5 m, and 1 of η."""
 MARGIN_M = 3.0
 CELL_M = 0.5
 
@@ -33,46 +36,81 @@ class RadioMap:
         Distance of the grid's points (m).
     mean, sd : ndarray
         dBm and dB, shape (anchors, nx, ny).
+    known : ndarray of bool
+        Anchors that enough points heard, shape (anchors,); the others have the mean of their model and no ``sd``.
     """
 
     low: FloatArray
     cell: float
     mean: FloatArray
     sd: FloatArray
+    known: NDArray[np.bool_]
 
 
 def map_of(context: Context, anchors: Anchors, height_m: float) -> RadioMap | None:
-    """Return the map of the calibration's surveyed points; None where any anchor has fewer than three."""
+    """Return the map of the calibration's surveyed points; None where no anchor has three.
+
+    Each anchor's P_d0 and η are part of the process (Rasmussen and Williams 2006, section 2.7), with what the anchors
+    of its technology differ by as prior; what is left has the variance that all anchors' residuals have together,
+    half of it room-sized (:data:`LENGTH_M`), half within a wavelength. The doubt has all three.
+    """
     calibration = context.calibrations.get("radio")
     if calibration is None or not calibration.usable or not len(anchors):
         return None
     points = {str(a["mac"]): a.get("points", []) for a in calibration.values.get("anchors", ())}
     mine = [np.array(points.get(mac, []), dtype=np.float64).reshape(-1, 4) for mac in anchors.macs]
-    if min(len(m) for m in mine) < 3:
+    known = np.array([len(m) >= LEAST_POINTS for m in mine])
+    if not known.any():
         return None
     surveyed = np.vstack([*(m[:, :2] for m in mine), anchors.plane])
     low = surveyed.min(axis=0) - MARGIN_M
     nx, ny = (np.ceil((surveyed.max(axis=0) + MARGIN_M - low) / CELL_M).astype(int) + 1).tolist()
     axes = low[0] + CELL_M * np.arange(nx), low[1] + CELL_M * np.arange(ny)
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    mean, sd = np.empty((len(mine), nx * ny)), np.empty((len(mine), nx * ny))
     up = anchors.above(height_m)
-    for k, m in enumerate(mine):
-        expected = _model(anchors, k, m[:, :2], m[:, 2] - anchors.position[k, 2])
-        # Half of what the model leaves is room-sized, half changes within a wavelength.
-        variance = max(float(np.mean((m[:, 3] - expected) ** 2)), 1.0)
+    models = [
+        _design(anchors, k, grid, np.full(len(grid), up[k])) @ [anchors.p_d0[k], anchors.eta[k]]
+        for k in range(len(mine))
+    ]
+    mean, sd = np.array(models), np.full((len(mine), nx * ny), np.nan)
+    offset = float(calibration.values.get("offsets_db", {}).get(device_of(context.metadata), 0.0))
+    designs = [_design(anchors, k, m[:, :2], m[:, 2] - anchors.position[k, 2]) for k, m in enumerate(mine)]
+    for k in np.flatnonzero(known).tolist():
+        m, design, technology = mine[k], designs[k], anchors.technology[k]
+        alike = [j for j in np.flatnonzero(known).tolist() if anchors.technology[j] == technology]
+        variance = _residual_variance([(designs[j], mine[j][:, 3]) for j in alike])
+        prior, spread = spread_of(calibration.values, technology) or (_common(designs, mine, alike), WEAK)
+        where = _design(anchors, k, grid, np.full(len(grid), up[k]))
         between = np.linalg.norm(m[:, None, :2] - m[None, :, :2], axis=2)
-        cross = 0.5 * variance * np.exp(-np.linalg.norm(grid[:, None] - m[None, :, :2], axis=2) / LENGTH_M)
-        covariance = 0.5 * variance * (np.exp(-between / LENGTH_M) + np.eye(len(m)))
+        apart = np.linalg.norm(grid[:, None] - m[None, :, :2], axis=2)
+        cross = 0.5 * variance * np.exp(-apart / LENGTH_M) + where @ spread @ design.T
+        covariance = (
+            0.5 * variance * (np.exp(-between / LENGTH_M) + np.eye(len(m))) + design @ spread @ design.T
+        )
         weights = np.linalg.solve(covariance, cross.T).T
-        mean[k] = _model(anchors, k, grid, np.full(len(grid), up[k])) + weights @ (m[:, 3] - expected)
-        sd[k] = np.sqrt(np.maximum(0.5 * variance - np.einsum("ij,ij->i", weights, cross), 1.0))
-    return RadioMap(low, CELL_M, mean.reshape(-1, nx, ny), sd.reshape(-1, nx, ny))
+        mean[k] = where @ prior + weights @ (m[:, 3] - design @ prior) + offset
+        whole = variance + np.einsum("ij,jk,ik->i", where, spread, where)
+        sd[k] = np.sqrt(np.maximum(whole - np.einsum("ij,ij->i", weights, cross), 1.0))
+    return RadioMap(low, CELL_M, mean.reshape(-1, nx, ny), sd.reshape(-1, nx, ny), known)
 
 
-def _model(anchors: Anchors, k: int, where: FloatArray, up: FloatArray) -> FloatArray:
+def _design(anchors: Anchors, k: int, where: FloatArray, up: FloatArray) -> FloatArray:
+    """Return the log-distance model's rows (1, −10 log10 d) at places (n, 2), shape (n, 2)."""
     square = ((where - anchors.plane[k]) ** 2).sum(axis=1) + np.where(np.isnan(up), 0.0, up) ** 2
-    return power_dbm(np.sqrt(np.maximum(square, 0.09)), anchors.p_d0[k], anchors.eta[k])
+    return np.column_stack([np.ones(len(where)), -5.0 * np.log10(np.maximum(square, 0.09))])
+
+
+def _common(designs: list[FloatArray], mine: list[FloatArray], alike: list[int]) -> FloatArray:
+    """Return P_d0 and η of anchors taken together."""
+    rows, powers = np.vstack([designs[j] for j in alike]), np.concatenate([mine[j][:, 3] for j in alike])
+    return np.asarray(np.linalg.lstsq(rows, powers, rcond=None)[0], dtype=np.float64)
+
+
+def _residual_variance(parts: list[tuple[FloatArray, FloatArray]]) -> float:
+    """Return the variance (dB²) of what each anchor's own model leaves, of all together."""
+    left = [p - design @ np.linalg.lstsq(design, p, rcond=None)[0] for design, p in parts]
+    freedom = sum(len(r) - 2 for r in left)
+    return max(float(sum(r @ r for r in left)) / max(freedom, 1), 1.0)
 
 
 @dataclass(frozen=True)

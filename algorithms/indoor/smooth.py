@@ -37,7 +37,7 @@ class IndoorSmooth(PlainEstimator):
     presets: ClassVar = IndoorFused.presets
     offline: ClassVar[bool] = True
     inputs = IndoorFused.inputs
-    outputs = IndoorFused.outputs
+    outputs = IndoorFused.outputs[:2]
 
     def start(self, context: Any) -> None:
         """Prepare both filters; the backward one starts anywhere."""
@@ -46,7 +46,15 @@ class IndoorSmooth(PlainEstimator):
         self.back.start(context)
         cloud: Cloud = self.back.state
         p = self.params
-        scatter(cloud, math.nan, 0.0, p.start_sd_m, math.radians(p.heading_sd_deg), p.scale_sd, p.offset_db)
+        scatter(
+            cloud,
+            math.nan,
+            0.0,
+            p.start_sd_m,
+            math.radians(p.heading_sd_deg),
+            p.scale_sd,
+            self.back.offset_db,
+        )
         self.kept: list[tuple[int, int, int, tuple[Any, ...]]] = []
 
     def take(self, message: Message) -> Iterable[Result]:

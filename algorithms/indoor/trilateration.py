@@ -19,9 +19,11 @@ SIGMA = Output(
     "sigma", "marcha_msgs/msg/NavigationSigma", ("sigma_pos_x", "sigma_pos_y", "sigma_pos_z"), frame="plan"
 )
 _RANGE = ("mac", "distance_m", "technology", "sd_m")
+TRIPLES = Output("triples", "marcha_msgs/msg/NamedValues", ("triple_x", "triple_y"), event=True, frame="plan")
 RANGED = (
     Output("ranges", "marcha_msgs/msg/Ranging", _RANGE, frame="plan"),
     Output("corrected", "marcha_msgs/msg/Ranging", _RANGE, frame="plan"),
+    TRIPLES,
 )
 
 
@@ -58,8 +60,8 @@ class IndoorTrilateration(PlainEstimator):
 
     def answer(self, ranges: WindowRanges) -> list[Result]:
         """Return the results of a window."""
-        results = list(ranging_results(self.windows, ranges))
         fix = self.windows.fix(ranges)
+        results = list(ranging_results(self.windows, ranges))
         if fix is not None:
             (x, y), covariance = fix
             results.append(Result("position", ranges.end_ns, (x, y, self.params.height_m)))
@@ -73,9 +75,11 @@ class IndoorTrilateration(PlainEstimator):
 
 
 def ranging_results(windows: Windows, ranges: WindowRanges) -> Iterable[Result]:
-    """Yield the ranges of a window before and after the correction."""
+    """Yield the ranges of a window before and after the correction, and what each three anchors say."""
     a = windows.anchors
     for i, k in enumerate(ranges.anchors.tolist()):
         about = (a.technology[k], float(ranges.sigma[i]))
         yield Result("ranges", ranges.end_ns, (a.macs[k], float(ranges.plane[i]), *about))
         yield Result("corrected", ranges.end_ns, (a.macs[k], float(ranges.better[i]), *about))
+    for x, y in ranges.triples.tolist():
+        yield Result("triples", ranges.end_ns, (x, y))

@@ -11,7 +11,7 @@ import numpy as np
 from ..contract import FloatArray, Remark
 from ..parameters import meta
 from .anchors import Anchors
-from .lateration import corrected, flatness, least_squares, mean_of_triples
+from .lateration import corrected, flatness, least_squares, triples
 from .pathloss import distance_m, plane_range_m
 
 SOURCE = "hybrid indoor positioning"
@@ -62,6 +62,8 @@ class WindowRanges:
         Ranges in the plane (m), before and after the correction.
     sigma : ndarray
         Standard deviation of ``slope`` (m).
+    triples : ndarray
+        Solution of each three anchors (m) once there was a fix by their mean, shape (m, 2).
     """
 
     end_ns: int
@@ -70,6 +72,7 @@ class WindowRanges:
     plane: FloatArray
     better: FloatArray
     sigma: FloatArray
+    triples: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 @dataclass
@@ -152,8 +155,8 @@ class Windows:
                 return None
             scale = max(1.0, fit.chi2) if np.isfinite(fit.chi2) else 1.0
             return fit.position, covariance * scale
-        mean = mean_of_triples(where, ranges.better, least_flatness=p.flat)
-        return (mean, covariance) if np.isfinite(mean).all() else None
+        ranges.triples = triples(where, ranges.better, least_flatness=p.flat)
+        return (ranges.triples.mean(axis=0), covariance) if len(ranges.triples) else None
 
     def remarks(self) -> list[Remark]:
         """Return what a user must know of the windows so far."""

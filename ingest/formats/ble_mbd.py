@@ -106,7 +106,7 @@ class BleMbd:
             metadata={
                 "device": {
                     "clock": "unix",
-                    "name": "BLE receivers and a beacon",
+                    "name": f"BLE receivers, beacon {' '.join(beacons[:4])}",
                     "time": "column 1, seconds",
                 },
                 "plan": {"handedness": "right", "frame": "x, y, z of the optical system, m"},

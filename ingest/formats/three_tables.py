@@ -20,9 +20,10 @@ import numpy as np
 import polars as pl
 
 from ...recording.errors import MarchaError, UsageError
+from ..anchors import is_anchor_header
 from ..checks import SensorCheck, check_plausible
 from ..contract import ChannelSpec, CommonOptions, Import, ReportBuilder
-from ..floor import Floor, is_anchor_header, kind_of, read_floor
+from ..floor import kind_of
 from ..headers import (
     TableHeader,
     TimeUnit,
@@ -92,6 +93,7 @@ class ThreeTables:
     Options = ThreeTablesOptions
     joins: ClassVar[bool] = True
     folders: ClassVar[bool] = True
+    floors: ClassVar[bool] = True
 
     def sniff(self, head: bytes, path: Path) -> float:
         """A header with sensor, x, y, z or with address and power beside the time; a folder with both tables."""
@@ -123,8 +125,11 @@ class ThreeTables:
             header = head_of(file)
             kind = _kind(header, file, named)
             if not kind or header is None:
+                columns = f" (columns {', '.join(header.names)[:60]})" if header is not None else ""
                 report.note(
-                    "unused_file", f"{file.name}: no table that is known: left out", subject=file.name
+                    "unused_file",
+                    f"{file.name}: no table that is known{columns}: left out; an anchor table has mac, x, y",
+                    subject=file.name,
                 )
             elif kind in tables:
                 raise UsageError(
@@ -134,7 +139,6 @@ class ThreeTables:
                 tables[kind] = file, header
         if not tables:
             _refuse(files, paths)
-        floor = read_floor(beside, {}, report) if beside else Floor()
         made, clock = _read(tables, named, options, report)
         metadata = {
             "device": {
@@ -145,15 +149,12 @@ class ThreeTables:
                 "reference_frame": "the plan's x and y, m",
             }
         }
-        if floor.metadata:
-            metadata["plan"] = floor.metadata
         specs = [ChannelSpec(t, s, "phone", metadata=m) for t, (s, m, _) in made.items()]
         return Import(
             channels=specs,
             blocks=iter([(t, table) for t, (*_, table) in made.items()]),
             report=report,
             metadata=metadata,
-            attachments=floor.attachments,
         )
 
 

@@ -1,4 +1,4 @@
-"""Views of radio positioning: signal strength by transmitter, ranges, and their circles about the anchors."""
+"""Views of radio positioning: signal strength by transmitter with its model, ranges and circles, points in the plan."""
 
 # ruff: noqa: D102 - begin, draw and end are documented once, in View
 
@@ -15,6 +15,9 @@ from ..text import printable
 from .base import View
 from .common import slug
 
+HELD_M = 1.2
+"""Height of a receiver, where nothing says it."""
+MODEL_POINTS = 400
 MOST = 24
 """Transmitters shown together; of more, those that are anchors or are heard most."""
 
@@ -76,6 +79,80 @@ class Signals(ByTransmitter):
     needs = ("mac", "rssi_dbm")
     column, unit, tabs = "rssi_dbm", "dBm", (OVERVIEW, RADIO)
 
+    def end(self) -> None:
+        super().end()
+        for number, mac in enumerate(self.counts):
+            self._model(mac, number)
+
+    def _model(self, mac: str, number: int) -> None:
+        """Draw what the anchor's model expects at the true positions, else at those of the first run."""
+        canvas = self.canvas
+        anchor = canvas.plan.anchors.get(mac.lower()) if canvas.plan else None
+        tracks = sorted(canvas.traces.items(), key=lambda item: "/reference" not in item[0])
+        if (
+            anchor is None
+            or not np.isfinite(anchor.p_d0 + anchor.eta)
+            or not tracks
+            or not tracks[0][1].count
+        ):
+            return
+        trace = tracks[0][1]
+        t_ns = trace.t_ns[:: max(1, trace.count // MODEL_POINTS)]
+        away = trace.at(t_ns)[:, :2] - anchor.position[:2]
+        up = anchor.position[2] - HELD_M if anchor.position[2] > 0 else 0.0
+        expected = anchor.p_d0 - 5.0 * anchor.eta * np.log10(np.maximum((away**2).sum(axis=1) + up**2, 0.09))
+        at = f"{self._at(mac)}/model"
+        canvas.lines(at, [f"{printable(mac)} model"], [style.run_color(number)], 1.0)
+        canvas.scalars(at, t_ns, expected)
+
+
+class PointsOnPlan(View):
+    """Several points of one time in the plan: they stand until the next ones come."""
+
+    schemas = ("marcha_msgs/msg/NamedValues",)
+    radius: float
+
+    def begin(self) -> None:
+        self.rest: tuple[Times, np.ndarray] = np.zeros(0, np.int64), np.zeros((0, 2))
+        points = rr.Points3D.from_fields(
+            colors=(*style.rgb(self.color), 150), radii=rr.Radius.ui_points(self.radius)
+        )
+        self.canvas.static(self.path, points)
+        self.canvas.show("space", self.path, tab=OVERVIEW, panel=SPACE, owner=self.owner)
+
+    def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
+        t_ns = np.concatenate([self.rest[0], t_ns])
+        where = np.concatenate([self.rest[1], columns_of(block, list(self.needs))])
+        whole = t_ns < t_ns[-1]  # the newest time may go on in the next block
+        self.rest = t_ns[~whole], where[~whole]
+        self._log(t_ns[whole], where[whole])
+
+    def end(self) -> None:
+        self._log(*self.rest)
+
+    def _log(self, t_ns: Times, where: np.ndarray) -> None:
+        finite = np.isfinite(where).all(axis=1)
+        times, counts = np.unique(t_ns[finite], return_counts=True)
+        flat = np.column_stack([where[finite], np.zeros(int(finite.sum()))]).astype(np.float32)
+        if len(times):
+            self.canvas.columns(self.path, times, rr.Points3D.columns(positions=flat).partition(counts))
+
+
+class Particles(PointsOnPlan):
+    """The cloud of a particle filter."""
+
+    title = "particles of a filter in the plan"
+    needs = ("particle_x", "particle_y")
+    radius = 2.0
+
+
+class Triples(PointsOnPlan):
+    """What each three anchors say: the fix is their mean."""
+
+    title = "solutions of each three anchors in the plan"
+    needs = ("triple_x", "triple_y")
+    radius = 3.5
+
 
 class Ranges(ByTransmitter):
     """Ranges to anchors, a line of points each, and a circle about the anchor in the plan."""
@@ -92,7 +169,9 @@ class Ranges(ByTransmitter):
         super()._style(mac, number)
         anchors = self.canvas.plan.anchors if self.canvas.plan else {}
         if mac.lower() in anchors:
-            color, thin = (*style.rgb(style.run_color(number)), 200), rr.Radius.ui_points(0.8)
+            # of a pair the corrected one is bright
+            bright, width = (90, 0.6) if self.what == "ranges" and self.role == "estimate" else (220, 1.2)
+            color, thin = (*style.rgb(style.run_color(number)), bright), rr.Radius.ui_points(width)
             self.canvas.static(self._circle(mac), rr.LineStrips3D.from_fields(colors=color, radii=thin))
             self.canvas.show("space", self._circle(mac), tab=OVERVIEW, panel=SPACE, owner=self.owner)
 
@@ -102,8 +181,10 @@ class Ranges(ByTransmitter):
         usable = np.isfinite(values) & (values > 0)
         if anchor is None or not usable.any():
             return
-        # the range is along the slope: in the plane of the floor it is shorter by the anchor's height
-        flat = np.sqrt(np.maximum(values[usable] ** 2 - anchor.position[2] ** 2, 0.0))
+        flat = values[usable]
+        if self.role != "estimate":  # along the slope; what an estimator ranged is in the plane already
+            up = anchor.position[2] - HELD_M if anchor.position[2] > 0 else 0.0
+            flat = np.sqrt(np.maximum(flat**2 - up**2, 0.0))
         centre = np.tile([*anchor.position[:2], 0.0], (len(flat), 1))
         strips = circle(centre, np.column_stack([flat, flat]))
         self.canvas.columns(self._circle(mac), t_ns[usable], rr.LineStrips3D.columns(strips=list(strips)))

@@ -7,7 +7,7 @@ import rerun as rr
 
 from .. import style
 from ..canvas import OVERVIEW, SPACE, Canvas
-from ..floor import FloorPlan, floor_plan
+from ..floor import FloorPlan, floor_plan, with_calibration
 
 LINE = (150, 156, 164)
 BELOW_M = 0.02
@@ -16,7 +16,7 @@ BELOW_M = 0.02
 
 def draw_plan(canvas: Canvas) -> FloorPlan:
     """Draw what the recording's attachments say of the floor, and return it."""
-    plan = floor_plan(canvas.attachments)
+    plan = with_calibration(floor_plan(canvas.attachments), canvas.metadata)
     canvas.plan = plan
     if not plan:
         return plan
