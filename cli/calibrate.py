@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from cyclopts import Parameter
 
 from .console import Heading, Outcome, TextTable, progress
 from .errors import DEFECTS, DONE
 from .options import DEFAULT, Common, Force, MaybeOutput, Paths, Strings, instant, settings
+
+MOST_ROWS = 24
 
 
 def calibrate(
@@ -82,13 +85,41 @@ def calibrate(
     for one in calibrations:
         verdict = "" if one.usable else ": NOT USABLE"
         lines.append(Heading(f"{one.kind} of {one.subject or 'the recording'}{verdict}"))
-        lines.append(TextTable(["value", "is"], [(key, _shown(value)) for key, value in one.values.items()]))
+        lines += _tables(one.values)
         lines += [Heading(f"note: {remark}") for remark in one.remarks]
     lines += [Heading(f"written: {path}") for path in written]
     import msgspec
 
     document = {"calibrations": msgspec.to_builtins(calibrations), "outputs": [str(w) for w in written]}
     return Outcome(document, lines, DONE if all(c.usable for c in calibrations) else DEFECTS)
+
+
+def _tables(values: Mapping[str, Any]) -> list[Heading | TextTable]:
+    """Return the values as tables: numbers first, then a table each for what there are several of (anchors)."""
+    several = {
+        key: [{"": name, **row} for name, row in value.items()] if isinstance(value, dict) else value
+        for key, value in values.items()
+        if _rows(value)
+    }
+    found: list[Heading | TextTable] = [
+        TextTable(["value", "is"], [(k, _shown(v)) for k, v in values.items() if k not in several])
+    ]
+    for key, rows in several.items():
+        columns = list(
+            dict.fromkeys(c for row in rows for c, v in row.items() if not isinstance(v, list | dict))
+        )
+        found.append(
+            Heading(f"{key}: {len(rows)}" + (f", the first {MOST_ROWS}" if len(rows) > MOST_ROWS else ""))
+        )
+        cells = [tuple(_shown(row.get(c, "")) for c in columns) for row in rows[:MOST_ROWS]]
+        found.append(TextTable(columns, cells))
+    return found
+
+
+def _rows(value: object) -> bool:
+    """Whether a value is several records, by number or by name."""
+    parts = list(value.values()) if isinstance(value, dict) else value if isinstance(value, list) else []
+    return bool(parts) and all(isinstance(p, dict) for p in parts)
 
 
 def _shown(value: object) -> str:

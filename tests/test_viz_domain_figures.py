@@ -15,12 +15,12 @@ from .viz_walks import indoor, leg, phone
 
 KINDS = {
     "phone": ("signals", "steps", "heading", "fixes", "map", "error"),
-    "indoor": ("floor", "radio", "error"),
+    "indoor": ("floor", "radio", "error", "anchors"),
     "leg": ("signals", "joints", "cycles", "jumps", "strides"),
 }
 
 
-ON_A_FLOOR = ("geometry", "radiomap", "ranges", "powers", "threshold")
+ON_A_FLOOR = ("geometry", "radiomap", "ranges", "powers", "threshold", "triples", "points", "particles")
 """Drawn of a simulated floor, in test_indoor_survey."""
 
 

@@ -370,13 +370,15 @@ def test_ranges_are_circles_about_their_anchors_in_the_plane_of_the_floor(tmp_pa
     rec = indoor(tmp_path / "a.mcap")
     assert unseen(rec, tmp_path) == []
     mac = "00:00:00:00:00:01"
-    x, y, z = ANCHORS[mac][1]
+    x, y, _ = ANCHORS[mac][1]
     entity = f"/run/indoor_trilateration/ranges/circle/{rr.escape_entity_path_part(mac)}"
     _, ring = column(tmp_path / "drawn.rrd", entity, "LineStrips3D:strips")
     ranges = rec.table("/estimate/indoor_trilateration/ranges").filter(pl.col("mac") == mac)
-    for strip, slope in zip(ring[:, 0], ranges["distance_m"], strict=True):
+    for strip, plane in zip(
+        ring[:, 0], ranges["distance_m"], strict=True
+    ):  # a run's are in the plane already
         radius = np.hypot(strip[:, 0] - x, strip[:, 1] - y)
-        np.testing.assert_allclose(radius, np.sqrt(slope**2 - z**2), rtol=1e-5)
+        np.testing.assert_allclose(radius, plane, rtol=1e-5)
 
 
 def test_the_ellipse_is_that_of_95_percent_about_the_position(tmp_path: Path) -> None:

@@ -77,6 +77,17 @@ class IndoorFusedParams(msgspec.Struct, frozen=True, kw_only=True):
             ge=-1,
         ),
     ] = -1.0
+    pattern_db: Annotated[
+        float,
+        meta(
+            "how much stronger or weaker the receiver (or tag) is on one side, standard deviation along each axis of "
+            "the plan; its turning is followed",
+            "dB",
+            "",
+            ge=0,
+        ),
+    ] = 2.0
+    pattern_s: Annotated[float, meta("time over which it looks the same way", "s", "", gt=0)] = 3.0
     freedom: Annotated[float, meta("degrees of freedom of Student's t", "", "Lange et al. 1989", gt=0)] = 4.0
     range_sd_m: Annotated[float, meta("of ranges that are measured as such", "m", "", gt=0)] = 0.3
     speed: Annotated[
@@ -173,8 +184,8 @@ class IndoorFused(KernelEstimator):
         north = plan_frame(context, p.x_axis_azimuth_deg)[2]  # without it headings are taken as the plan's
         self.from_east = bool(steps) and steps[0].frame_id != "plan" and north
         calibration = context.calibrations.get("radio")
-        strange = (
-            calibration is not None and device_of(context.metadata) not in calibration.values["offsets_db"]
+        strange = calibration is not None and device_of(context.metadata) not in calibration.values.get(
+            "offsets_db", {}
         )
         self.offset_db = p.offset_db if p.offset_db >= 0 else STRANGE_DB if strange else 0.0
         self.unknown: set[str] = set()
@@ -230,6 +241,8 @@ class IndoorFused(KernelEstimator):
             "drift": 0.1,
             "fast": p.fast_db,
             "freedom": p.freedom,
+            "pattern": p.pattern_db,
+            "pattern_s": p.pattern_s,
             "range_sd": p.range_sd_m,
             "wall": math.log(1e-4),
             "step_m": p.step_m,

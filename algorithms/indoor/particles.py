@@ -19,8 +19,9 @@ from ..contract import FloatArray
 from ..numerics.compiled import compiled, inlined
 from .steps import take_acceleration
 
-X, Y, VX, VY, OFFSET, SCALE, GAIN, PATH, LOGW, COLUMNS = range(10)
-"""Columns of a particle; PATH is the distance that it has walked (m), GAIN the receiver's offset (dB)."""
+X, Y, VX, VY, OFFSET, SCALE, GAIN, PATH, LOGW, AHEAD_X, AHEAD_Y, COLUMNS = range(12)
+"""Columns of a particle; PATH is the distance that it has walked (m), GAIN the receiver's offset (dB), AHEAD how
+much stronger it hears anchors along x and y (dB): antenna and body, which turn."""
 
 (
     PATH_AT,
@@ -69,6 +70,8 @@ SETTINGS = np.dtype(
         ("drift", "f8"),  # random walk while steps are known, m/√s
         ("fast", "f8"),
         ("freedom", "f8"),
+        ("pattern", "f8"),  # dB by direction, and the time (s) over which it stays
+        ("pattern_s", "f8"),
         ("range_sd", "f8"),
         ("wall", "f8"),  # log-likelihood of a move through a wall
         ("step_m", "f8"),
@@ -186,6 +189,8 @@ def scatter(c: Any, x: float, y: float, sd: float, offset_sd: float, scale_sd: f
         p[GAIN] = gain_sd * _normal(s)
         p[PATH] = 0.0
         p[LOGW] = 0.0
+        p[AHEAD_X] = s.pattern * _normal(s) if s.pattern > 0.0 else 0.0
+        p[AHEAD_Y] = s.pattern * _normal(s) if s.pattern > 0.0 else 0.0
         for k in range(c.a.shape[0]):
             b = c.b[i, k]
             b[:] = 0.0
@@ -225,9 +230,14 @@ def _drift(c: Any, t_ns: int) -> None:
     draw = s.speed * math.sqrt(1.0 - keep * keep)
     walk = s.drift * math.sqrt(dt)
     gain = 0.05 * math.sqrt(dt)
+    stays = math.exp(-dt / s.pattern_s)
+    turn = s.pattern * math.sqrt(1.0 - stays * stays)
     for i in range(c.p.shape[0]):
         p = c.p[i]
         p[GAIN] += gain * 0.1 * _normal(s) if p[GAIN] != 0.0 else 0.0
+        if s.pattern > 0.0:
+            p[AHEAD_X] = stays * p[AHEAD_X] + turn * _normal(s)
+            p[AHEAD_Y] = stays * p[AHEAD_Y] + turn * _normal(s)
         if s.walking == 1:
             # not part of PATH: the length of a random walk depends on how finely it is cut, and a person who
             # stands keeps the same shadowing
@@ -293,6 +303,9 @@ def _power(c: Any, k: int, rssi: float) -> None:
         ph_eta = b[C_SHADOW_ETA] + b[C_POWER_ETA] + h * b[V_ETA]
         slow = ph_shadow + ph_power + h * ph_eta
         variance = slow + fast2
+        if s.pattern > 0.0:
+            ax, ay = c.a[k, 0] - p[X], c.a[k, 1] - p[Y]
+            expected += (p[AHEAD_X] * ax + p[AHEAD_Y] * ay) / max(math.sqrt(ax * ax + ay * ay), 0.3)
         e = rssi - expected - p[GAIN] - b[SHADOW] - b[D_POWER] - h * b[D_ETA]
         nu = s.freedom
         p[LOGW] -= 0.5 * math.log(variance) + 0.5 * (nu + 1.0) * math.log(1.0 + e * e / (nu * variance))

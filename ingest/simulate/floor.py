@@ -88,6 +88,11 @@ class FloorOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
         Loss (dB) while a path is blocked, share of the time in which it is, mean length of a stretch (s).
     offset_db : float
         Of this phone against the calibration.
+    pattern_db, pattern_s : float
+        A carrier that turns about itself: how much stronger or weaker (dB) an anchor is heard by its direction, and
+        the time of a turn (s).
+    silent : str
+        Names of anchors that are never heard, between blanks.
     wifi_s, wifi_jitter_s : float
         Time between two Wi-Fi scans and its standard deviation (s).
     ble_s : float
@@ -111,6 +116,9 @@ class FloorOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     blocked_share: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.05
     blocked_s: _Positive = 3.0
     offset_db: float = 0.0
+    pattern_db: _NonNegative = 0.0
+    pattern_s: _Positive = 4.0
+    silent: str = ""
     wifi_s: _Positive = 2.0
     wifi_jitter_s: _NonNegative = 0.3
     ble_s: _Positive = 0.3
@@ -255,7 +263,11 @@ def _radio(t_ns: np.ndarray, position: FloatArray, o: FloorOptions, seed: int) -
         np.maximum(o.wifi_s + o.wifi_jitter_s * scans.standard_normal(int(end / o.wifi_s * 2) + 4), 0.1)
     )
     beats = beats[beats < end]
-    for anchor in ANCHORS:
+    lost = set(o.silent.split())
+    if unknown := lost - {a.name for a in ANCHORS}:
+        names = ", ".join(a.name for a in ANCHORS)
+        raise UsageError(f"silent={min(unknown)!r}: no such anchor; there are {names}")
+    for anchor in (a for a in ANCHORS if a.name not in lost):
         rng = _rng(seed, anchor.name)
         if anchor.technology == "wifi":
             seen = np.maximum(beats - rng.uniform(0.0, 0.2, len(beats)), 0.0)
@@ -270,6 +282,8 @@ def _radio(t_ns: np.ndarray, position: FloatArray, o: FloorOptions, seed: int) -
         d = np.sqrt(np.maximum(plane2 + (anchor.z - HELD_Z) ** 2, 0.09))
         power = anchor.p_d0 - 10 * anchor.eta * np.log10(d) + o.offset_db
         power += o.shadow_db * shadowing(where, o.shadow_m, _rng(seed, f"shadow {anchor.name}"))
+        bearing = np.arctan2(anchor.y - where[:, 1], anchor.x - where[:, 0])
+        power += o.pattern_db * np.cos(2 * np.pi * seen / o.pattern_s - bearing)
         power -= o.blocked_db * _blocked(seen, o, _rng(seed, f"blocked {anchor.name}"))
         power = np.round(power + o.multipath_db * rng.standard_normal(len(seen)))
         heard = power >= o.weakest_dbm

@@ -114,9 +114,7 @@ class PointsOnPlan(View):
 
     def begin(self) -> None:
         self.rest: tuple[Times, np.ndarray] = np.zeros(0, np.int64), np.zeros((0, 2))
-        points = rr.Points3D.from_fields(
-            colors=(*style.rgb(self.color), 150), radii=rr.Radius.ui_points(self.radius)
-        )
+        points = rr.Points3D.from_fields(colors=style.rgb(self.color), radii=rr.Radius.ui_points(self.radius))
         self.canvas.static(self.path, points)
         self.canvas.show("space", self.path, tab=OVERVIEW, panel=SPACE, owner=self.owner)
 
@@ -161,6 +159,25 @@ class Ranges(ByTransmitter):
     schemas = ("marcha_msgs/msg/Ranging",)
     needs = ("mac", "distance_m")
     column, unit = "distance_m", "m"
+    last_ns = -1
+
+    def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
+        super().draw(t_ns, block)
+        if self.role == "estimate":
+            self._forget(t_ns, block["mac"].fill_null("unknown").to_numpy())
+
+    def _forget(self, t_ns: Times, macs: np.ndarray) -> None:
+        """Take away the circles of anchors that a window did not hear: an old circle is no range of now."""
+        windows = np.unique(t_ns)
+        windows = windows[windows > self.last_ns]  # the first may have begun in the block before
+        self.last_ns = int(t_ns[-1])
+        anchors = self.canvas.plan.anchors if self.canvas.plan else {}
+        for mac in (m for m in self.counts if m.lower() in anchors):
+            silent = np.setdiff1d(windows, t_ns[macs == mac])
+            empty = np.zeros(len(silent), dtype=np.int64)
+            self.canvas.columns(
+                self._circle(mac), silent, rr.LineStrips3D.columns(strips=[]).partition(empty)
+            )
 
     def _circle(self, mac: str) -> str:
         return f"{self.path}/circle/{slug(mac)}"
