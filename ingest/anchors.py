@@ -48,7 +48,7 @@ RECEIVED_DBM = (-100.0, -15.0)
 
 
 @dataclass(frozen=True)
-class Layout:
+class GeographicLayout:
     """How degrees become metres of the plan.
 
     Attributes
@@ -72,13 +72,13 @@ class Layout:
 
 def layout_of(
     low: Sequence[float], high: Sequence[float], width_m: float | None = None, height_m: float | None = None
-) -> Layout:
+) -> GeographicLayout:
     """Return the layout of what lies between two corners (longitude, latitude in degrees), on its size where stated."""
     scale = [EARTH_M * math.cos(math.radians((low[1] + high[1]) / 2)), EARTH_M]
     for k, size in enumerate((width_m, height_m)):
         if size is not None and high[k] > low[k]:
             scale[k] = size / (high[k] - low[k])
-    return Layout((low[0], low[1]), (scale[0], scale[1]))
+    return GeographicLayout((low[0], low[1]), (scale[0], scale[1]))
 
 
 def is_anchor_header(header: TableHeader) -> bool:
@@ -94,8 +94,8 @@ def _roles(header: TableHeader) -> dict[str, int]:
 
 
 def read_anchors(
-    path: Path, report: ReportBuilder, *, layout: Layout | None = None, drawn: Path | None = None
-) -> tuple[SourceAttachment, tuple[str, ...], Layout | None]:
+    path: Path, report: ReportBuilder, *, layout: GeographicLayout | None = None, drawn: Path | None = None
+) -> tuple[SourceAttachment, tuple[str, ...], GeographicLayout | None]:
     """Return the attachment ``anchors.csv`` of a table, the addresses, and how its degrees were laid out on their own.
 
     Parameters
@@ -104,7 +104,7 @@ def read_anchors(
         The table.
     report : ReportBuilder
         Takes what is repaired: units of length, powers without their sign, degrees.
-    layout : Layout, optional
+    layout : GeographicLayout, optional
         Of the plan that is given with it, where that is in degrees.
     drawn : Path, optional
         The plan (outline or picture) that is given with it.
@@ -165,8 +165,12 @@ def _in_metres(
 
 
 def _on_the_plan(
-    cells: pl.DataFrame, path: Path, report: ReportBuilder, layout: Layout | None, drawn: Path | None
-) -> tuple[pl.DataFrame, Layout | None]:
+    cells: pl.DataFrame,
+    path: Path,
+    report: ReportBuilder,
+    layout: GeographicLayout | None,
+    drawn: Path | None,
+) -> tuple[pl.DataFrame, GeographicLayout | None]:
     """Return the cells with x and y in metres of the plan, and the layout where it is the anchors' own."""
     if not {"x", "y"} <= set(cells.columns):
         lon, lat = "lon", "lat"

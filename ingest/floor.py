@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ..recording.errors import MarchaError, UsageError
-from .anchors import DEGREES_SPAN, Layout, is_anchor_header, layout_of, read_anchors
+from .anchors import DEGREES_SPAN, GeographicLayout, is_anchor_header, layout_of, read_anchors
 from .contract import ReportBuilder, SourceAttachment
 from .headers import header_of
 from .text import start_of
@@ -96,7 +96,7 @@ def read_floor(paths: Sequence[Path], settings: Mapping[str, Any], report: Repor
     if unknown:
         raise UsageError(f"plan.{min(unknown)}: a plan has {', '.join((*PLACE_KEYS, 'handedness', 'rooms'))}")
     floor = Floor()
-    layout: Layout | None = None
+    layout: GeographicLayout | None = None
     place = _place(by_kind.get("place"), by_kind.get("picture") or by_kind.get("outline"), settings)
     if "outline" in by_kind:
         data, place, layout = _outline(by_kind["outline"], place, str(settings.get("rooms", "room")))
@@ -172,7 +172,9 @@ def _filled(place: Mapping[str, Any], picture: Path) -> dict[str, Any]:
     return {**{k: v for k, v in place.items() if k != "metres_per_pixel"}, **sides}
 
 
-def _outline(file: Path, place: Mapping[str, Any], rooms: str) -> tuple[bytes, dict[str, Any], Layout | None]:
+def _outline(
+    file: Path, place: Mapping[str, Any], rooms: str
+) -> tuple[bytes, dict[str, Any], GeographicLayout | None]:
     """Return GeoJSON in metres, each feature with a ``kind``, where it lies, and how degrees were laid out."""
     if rooms not in KINDS:
         raise UsageError(f"plan.rooms={rooms!r}: one of {', '.join(KINDS)}")
@@ -214,7 +216,7 @@ def _points(node: Any) -> Iterator[Any]:
             yield from _points(part)
 
 
-def _mapped(node: Any, layout: Layout) -> Any:
+def _mapped(node: Any, layout: GeographicLayout) -> Any:
     if node and isinstance(node[0], int | float):
         return list(layout.metres(node[0], node[1]))
     return [_mapped(part, layout) for part in node]

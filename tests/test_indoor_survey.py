@@ -309,9 +309,9 @@ def test_figures_of_a_floor_show_what_the_recording_says(tmp_path):
     made = simulate("floor-walk", tmp_path, seed=2)
     convert(made.paths, tmp_path / "w.mcap")
     rec = open_recording(tmp_path / "w.mcap")
-    replay(rec, ["indoor.trilateration", "indoor.pdr"], out=tmp_path / "d.mcap")
+    replay(rec, ["indoor.trilateration", "indoor.pdr", "indoor.fused"], out=tmp_path / "d.mcap")
     rec = open_recording(tmp_path / "d.mcap")
-    for kind in ("geometry", "radiomap", "ranges", "powers", "threshold"):
+    for kind in ("geometry", "radiomap", "ranges", "powers", "threshold", "triples", "points", "particles"):
         drawn = viz.figure(rec, kind=kind)
         assert any(ax.has_data() for ax in drawn.axes), kind
     found = geometry_of(rec)
