@@ -101,19 +101,19 @@ def _tables(values: Mapping[str, Any]) -> list[Heading | TextTable]:
         for key, value in values.items()
         if _rows(value)
     }
-    found: list[Heading | TextTable] = [
+    shown: list[Heading | TextTable] = [
         TextTable(["value", "is"], [(k, _shown(v)) for k, v in values.items() if k not in several])
     ]
     for key, rows in several.items():
         columns = list(
             dict.fromkeys(c for row in rows for c, v in row.items() if not isinstance(v, list | dict))
         )
-        found.append(
+        shown.append(
             Heading(f"{key}: {len(rows)}" + (f", the first {MOST_ROWS}" if len(rows) > MOST_ROWS else ""))
         )
         cells = [tuple(_shown(row.get(c, "")) for c in columns) for row in rows[:MOST_ROWS]]
-        found.append(TextTable(columns, cells))
-    return found
+        shown.append(TextTable(columns, cells))
+    return shown
 
 
 def _rows(value: object) -> bool:

@@ -132,8 +132,8 @@ def convert(
         settings = registry.share_options(recognised, chosen)
         floor_report = ReportBuilder()
         own = [f for (registered, files) in recognised for f in floor_files(registered.importer, files)]
-        given = {kind_of(p) for p in beside}  # what the user names beside a log goes before its own
-        floor = read_floor([*beside, *(f for f in own if kind_of(f) not in given)], place, floor_report)
+        named = {kind_of(p) for p in beside}  # what the user names beside a log goes before its own
+        floor = read_floor([*beside, *(f for f in own if kind_of(f) not in named)], place, floor_report)
         floor.attachments += read_underlay(under)
         beside += under
         side_files = [read_truth(source.files[0]) for source in recognised]

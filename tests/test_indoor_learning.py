@@ -101,7 +101,7 @@ def test_a_radio_map_is_as_sure_as_it_is_right(calibration: Calibration) -> None
     anchors = anchors_of(context)
     found = map_of(context, anchors, 1.2)
     assert found is not None
-    assert found.known.tolist() == [True] * 5 + [
+    assert found.mapped.tolist() == [True] * 5 + [
         False
     ]  # one anchor without survey leaves the others their map
     rng = np.random.default_rng(3)

@@ -37,9 +37,9 @@ def draw_floor(ax: Axes, plan: FloorPlan, *, names: bool = True) -> None:
     for line in plan.outlines:
         ax.plot(line[:, 0], line[:, 1], color="#777777", linewidth=0.8)
     for i, kind in enumerate(dict.fromkeys(a.technology for a in plan.anchors.values())):
-        at = np.array([a.position for a in plan.anchors.values() if a.technology == kind])
+        where = np.array([a.position for a in plan.anchors.values() if a.technology == kind])
         label = f"anchors {kind}".strip() if names else None
-        ax.plot(at[:, 0], at[:, 1], "s^vPX*"[i % 6], color="black", label=label)
+        ax.plot(where[:, 0], where[:, 1], "s^vPX*"[i % 6], color="black", label=label)
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_xlabel("x (m)", fontsize=9)
     ax.set_ylabel("y (m)", fontsize=9)
@@ -105,14 +105,14 @@ def triples(rec: Recording, fig: Figure) -> None:
     if not runs:
         raise _nothing(rec, "no run with triples (indoor.trilateration, indoor.hybrid)")
     run, plan, truth = runs[0], plan_of(rec), true_positions(rec)
-    found, ranged = rec.table(f"{run}/triples"), rec.table(f"{run}/corrected")
-    times = np.unique(found["t_ns"].to_numpy())
+    solutions, ranged = rec.table(f"{run}/triples"), rec.table(f"{run}/corrected")
+    times = np.unique(solutions["t_ns"].to_numpy())
     chosen = times[np.unique(np.linspace(0, len(times) - 1, min(4, len(times))).round().astype(int))]
     fig.set_size_inches(13.0, 4.2 * ((len(chosen) + 1) // 2))
     axes = np.ravel(fig.subplots((len(chosen) + 1) // 2, min(2, len(chosen)), squeeze=False))
     for ax, t in zip(axes, chosen.tolist(), strict=False):
         draw_floor(ax, plan, names=False)
-        points = found.filter(found["t_ns"] == t).select("triple_x", "triple_y").to_numpy()
+        points = solutions.filter(solutions["t_ns"] == t).select("triple_x", "triple_y").to_numpy()
         for mac, distance in ranged.filter(ranged["t_ns"] == t).select("mac", "distance_m").iter_rows():
             if (anchor := plan.anchors.get(mac)) is not None:
                 ring = circle(anchor.position[None, :], np.full((1, 2), distance))[0]
@@ -126,8 +126,8 @@ def triples(rec: Recording, fig: Figure) -> None:
         ax.set_xlim(low[0], high[0])
         ax.set_ylim(low[1], high[1])
         beyond = f", {outside} triples beyond the picture" if outside else ""
-        at = (t - (rec.start_ns or 0)) / 1e9
-        ax.set_title(f"{printable(run[10:])}, window to {at:.0f} s{beyond}", fontsize=9, loc="left")
+        second = (t - (rec.start_ns or 0)) / 1e9
+        ax.set_title(f"{printable(run[10:])}, window to {second:.0f} s{beyond}", fontsize=9, loc="left")
         ax.legend(fontsize=7, loc="upper right")
     for ax in axes[len(chosen) :]:
         ax.set_axis_off()

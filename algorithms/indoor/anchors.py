@@ -235,10 +235,10 @@ def anchors_of(context: Context, *, without: str = "", need_model: bool = True) 
 
 def spread_of(values: Mapping[str, Any], technology: str) -> tuple[FloatArray, FloatArray] | None:
     """Return mean (2,) and covariance (2, 2) of (P_d0, η) over the anchors; None where too few are calibrated."""
-    found = dict(values.get("pooled", {})).get(technology, {})
-    if "between" not in found:
+    pool = dict(values.get("pooled", {})).get(technology, {})
+    if "between" not in pool:
         return None
-    return np.array(found["mean"], dtype=np.float64), np.array(found["between"], dtype=np.float64)
+    return np.array(pool["mean"], dtype=np.float64), np.array(pool["between"], dtype=np.float64)
 
 
 def _pooled(

@@ -263,8 +263,8 @@ class IndoorFused(KernelEstimator):
         mean = sd = np.zeros((0, 2, 2))
         if radio_map is not None:
             mean, sd = radio_map.mean, radio_map.sd
-            table[:, 10] = radio_map.known
-            table[radio_map.known, 7:10] = 0.0  # the map's own doubt has them
+            table[:, 10] = radio_map.mapped
+            table[radio_map.mapped, 7:10] = 0.0  # the map's own doubt has them
             one["map_low"], one["map_cell"] = radio_map.low, radio_map.cell
         walk = make_state(threshold=p.threshold, least_s=0.15, most_s=0.4, gravity_s=0.08, along_gravity=True)
         cloud = Cloud(

@@ -74,8 +74,8 @@ def triples(anchors: ArrayLike, ranges: ArrayLike, *, least_flatness: float = 0.
 
 def mean_of_triples(anchors: ArrayLike, ranges: ArrayLike, *, least_flatness: float = 0.01) -> FloatArray:
     """Return the mean of the :func:`triples` (eq 4.6), NaN where every triple is on a line."""
-    found = triples(anchors, ranges, least_flatness=least_flatness)
-    return found.mean(axis=0) if len(found) else np.full(2, np.nan)
+    solutions = triples(anchors, ranges, least_flatness=least_flatness)
+    return solutions.mean(axis=0) if len(solutions) else np.full(2, np.nan)
 
 
 def votes(anchors: ArrayLike, ranges: ArrayLike, *, both: bool = False) -> FloatArray:

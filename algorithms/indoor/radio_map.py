@@ -36,7 +36,7 @@ class RadioMap:
         Distance of the grid's points (m).
     mean, sd : ndarray
         dBm and dB, shape (anchors, nx, ny).
-    known : ndarray of bool
+    mapped : ndarray of bool
         Anchors that enough points heard, shape (anchors,); the others have the mean of their model and no ``sd``.
     """
 
@@ -44,7 +44,7 @@ class RadioMap:
     cell: float
     mean: FloatArray
     sd: FloatArray
-    known: NDArray[np.bool_]
+    mapped: NDArray[np.bool_]
 
 
 def map_of(context: Context, anchors: Anchors, height_m: float) -> RadioMap | None:
@@ -59,8 +59,8 @@ def map_of(context: Context, anchors: Anchors, height_m: float) -> RadioMap | No
         return None
     points = {str(a["mac"]): a.get("points", []) for a in calibration.values.get("anchors", ())}
     mine = [np.array(points.get(mac, []), dtype=np.float64).reshape(-1, 4) for mac in anchors.macs]
-    known = np.array([len(m) >= LEAST_POINTS for m in mine])
-    if not known.any():
+    mapped = np.array([len(m) >= LEAST_POINTS for m in mine])
+    if not mapped.any():
         return None
     surveyed = np.vstack([*(m[:, :2] for m in mine), anchors.plane])
     low = surveyed.min(axis=0) - MARGIN_M
@@ -75,9 +75,9 @@ def map_of(context: Context, anchors: Anchors, height_m: float) -> RadioMap | No
     mean, sd = np.array(models), np.full((len(mine), nx * ny), np.nan)
     offset = float(calibration.values.get("offsets_db", {}).get(device_of(context.metadata), 0.0))
     designs = [_design(anchors, k, m[:, :2], m[:, 2] - anchors.position[k, 2]) for k, m in enumerate(mine)]
-    for k in np.flatnonzero(known).tolist():
+    for k in np.flatnonzero(mapped).tolist():
         m, design, technology = mine[k], designs[k], anchors.technology[k]
-        alike = [j for j in np.flatnonzero(known).tolist() if anchors.technology[j] == technology]
+        alike = [j for j in np.flatnonzero(mapped).tolist() if anchors.technology[j] == technology]
         variance = _residual_variance([(designs[j], mine[j][:, 3]) for j in alike])
         prior, spread = spread_of(calibration.values, technology) or (_common(designs, mine, alike), WEAK)
         where = _design(anchors, k, grid, np.full(len(grid), up[k]))
@@ -91,7 +91,7 @@ def map_of(context: Context, anchors: Anchors, height_m: float) -> RadioMap | No
         mean[k] = where @ prior + weights @ (m[:, 3] - design @ prior) + offset
         whole = variance + np.einsum("ij,jk,ik->i", where, spread, where)
         sd[k] = np.sqrt(np.maximum(whole - np.einsum("ij,ij->i", weights, cross), 1.0))
-    return RadioMap(low, CELL_M, mean.reshape(-1, nx, ny), sd.reshape(-1, nx, ny), known)
+    return RadioMap(low, CELL_M, mean.reshape(-1, nx, ny), sd.reshape(-1, nx, ny), mapped)
 
 
 def _design(anchors: Anchors, k: int, where: FloatArray, up: FloatArray) -> FloatArray:

@@ -101,9 +101,9 @@ class Signals(ByTransmitter):
         away = trace.at(t_ns)[:, :2] - anchor.position[:2]
         up = anchor.position[2] - HELD_M if anchor.position[2] > 0 else 0.0
         expected = anchor.p_d0 - 5.0 * anchor.eta * np.log10(np.maximum((away**2).sum(axis=1) + up**2, 0.09))
-        at = f"{self._at(mac)}/model"
-        canvas.lines(at, [f"{printable(mac)} model"], [style.run_color(number)], 1.0)
-        canvas.scalars(at, t_ns, expected)
+        path = f"{self._at(mac)}/model"
+        canvas.lines(path, [f"{printable(mac)} model"], [style.run_color(number)], 1.0)
+        canvas.scalars(path, t_ns, expected)
 
 
 class PointsOnPlan(View):
