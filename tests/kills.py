@@ -41,8 +41,8 @@ class Command:
 
     name: str
     arguments: tuple[str, ...]
-    output: str
-    whole: Callable[[Path], bool]
+    output: str = ""
+    whole: Callable[[Path], bool] = lambda _: True
 
 
 def sound(path: Path) -> bool:
@@ -58,11 +58,17 @@ def full(path: Path) -> bool:
     return (path / "channels.json").is_file() and len(list(path.glob("*.csv"))) >= 2
 
 
+def dataset(path: Path) -> bool:
+    """Whether a dataset of BIDS has its description, its marks and a table."""
+    return (path / "dataset_description.json").is_file() and any(path.rglob("*_motion.tsv"))
+
+
 def any_file(path: Path) -> bool:
     """Whether a file has content."""
     return path.stat().st_size > 0
 
 
+WALK = ("-e", "foot.9iez")
 COMMANDS = (
     Command("convert", ("convert", "logs/conf-3333-walk.csv", "-o", "out.mcap"), "out.mcap", sound),
     Command("convert zip", ("convert", "logs/walk.zip", "-o", "out.mcap"), "out.mcap", sound),
@@ -79,9 +85,29 @@ COMMANDS = (
         "study",
         ("study", "study.toml", "-o", "out", "--workers", "2", "--data", "logs"),
         "out",
-        lambda _: True,
     ),
+    Command("cut", ("cut", "in.mcap", "--start", "1", "--end", "20", "-o", "out.mcap"), "out.mcap", sound),
+    Command(
+        "merge",
+        ("merge", "in.mcap", "in.mcap", "--prefix", "/a", "--prefix", "/b", "-o", "out.mcap"),
+        "out.mcap",
+        sound,
+    ),
+    Command("anonymize", ("anonymize", "in.mcap", "-o", "out.mcap"), "out.mcap", sound),
+    Command("report", ("report", "done.mcap", "--no-picture", "-o", "out.html"), "out.html", any_file),
+    Command("view", ("view", "done.mcap", "--rrd", "out.rrd"), "out.rrd", any_file),
+    Command("export bids", ("export", "in.mcap", "--to", "bids", "-o", "out"), "out", dataset),
+    Command("simulate", ("simulate", "rectangle", "-o", "out"), "out"),
+    Command("demo", ("demo", "-o", "out"), "out"),
+    Command("align", ("align", "leg.mcap", "-o", "out.mcap"), "out.mcap", sound),
+    Command("calibrate", ("calibrate", "imu", "in.mcap", "-o", "out.json"), "out.json", any_file),
+    Command("evaluate", ("evaluate", "done.mcap")),
+    Command("check", ("check", "in.mcap")),
+    Command("info", ("info", "in.mcap")),
+    Command("tune", ("tune", "in.mcap", *WALK, "-p", "window_s=0.05:0.1:3")),
 )
+PRINTING = {"formats", "estimators", "completion"}
+"""Commands that print what is installed: they read no file of the user, and write none."""
 
 
 @contextmanager
@@ -95,6 +121,9 @@ def prepared() -> Iterator[Path]:
         shutil.copy(made, folder / "logs" / "conf-3333-walk.csv")
         (folder / "study.toml").write_text(STUDY)
         run(folder, ("convert", "logs/conf-3333-walk.csv", "-o", "in.mcap")).communicate()
+        run(folder, ("replay", "in.mcap", *WALK, "-o", "done.mcap")).communicate()
+        squats = simulate("squats", folder / "raw", seed=1).paths
+        run(folder, ("convert", *map(str, squats), "-o", "leg.mcap")).communicate()
         shutil.make_archive(str(folder / "packed"), "zip", folder / "logs")
         shutil.rmtree(folder / "raw")
         (folder / "packed.zip").rename(folder / "logs" / "walk.zip")
@@ -180,17 +209,17 @@ def once(folder: Path, command: Command, after_s: float, number: int = signal.SI
             wrong.append(f"left behind at once: {sorted(left)}")
     for pid in living(process.pid):
         os.kill(pid, signal.SIGKILL)
-    if output.exists() and not command.whole(output):
+    if command.output and output.exists() and not command.whole(output):
         wrong.append("the output is not whole")
-    again = run(folder, (*command.arguments, "--force"))
+    again = run(folder, (*command.arguments, *(["--force"] if command.output else [])))
     _, said = again.communicate()
     if again.returncode not in (0, 3):
         wrong.append(f"the next run fails: {again.returncode} {said.decode()[-200:]}")
-    elif not output.exists() or not command.whole(output):
+    elif command.output and not (output.exists() and command.whole(output)):
         wrong.append("the next run's output is not whole")
     gone(again.pid, PATIENCE_S)
     left = names(folder) - before - {command.output}
-    if output.is_dir():
+    if command.output and output.is_dir():
         left |= {str(p.relative_to(folder)) for p in output.rglob(".*")}
     if left:
         wrong.append(f"left behind: {sorted(left)}")

@@ -141,6 +141,16 @@ def test_a_point_without_a_place_is_left_out_and_counted(tmp_path: Path, lat: st
     assert np.all(np.diff(table["t_ns"].to_numpy()) == [1e9] * 4 + [2e9] + [1e9] * 3)
 
 
+@pytest.mark.parametrize(
+    "time", ["9999-12-31T23:59:59Z", "0001-01-01T00:00:00+14:00", "2300-01-01", "x" * 900]
+)
+def test_a_point_at_a_time_that_no_clock_says_is_left_out(tmp_path: Path, time: str) -> None:
+    points = "".join(map(gpx_point, range(5))) + gpx_point(5).replace("2024-05-01T10:00:05Z", time)
+    (tmp_path / "walk.gpx").write_text(GPX.format(points))
+    done = convert(tmp_path / "walk.gpx", tmp_path / "out.mcap")
+    assert (done.report.rows_read, done.report.rows_dropped) == (6, 1)
+
+
 @pytest.mark.parametrize("place", ["", "-9.1", "x y z"])
 def test_a_place_of_too_few_numbers_is_left_out(tmp_path: Path, place: str) -> None:
     coords = "".join(

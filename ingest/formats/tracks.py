@@ -16,6 +16,7 @@ from ...recording.errors import MarchaError
 from ..contract import CommonOptions, Import, ReportBuilder
 from ..inertial import one_file
 from ..phonelog import Stream, declared, fix_part, require_rows
+from ..timestamps import MOST_NS
 
 
 class TrackImportOptions(CommonOptions, frozen=True, kw_only=True):
@@ -119,7 +120,8 @@ def _instant(text: str) -> int | None:
     except ValueError:
         return None
     moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-    return round(moment.timestamp() * 1e6) * 1000
+    stamp = round(moment.timestamp() * 1e6) * 1000
+    return stamp if abs(stamp) <= MOST_NS else None
 
 
 def _local(tag: object) -> str:

@@ -236,7 +236,7 @@ def _chunk(rng: Rng, parts: list[Record]) -> str:
         size = int(pick(rng, (*NUMBERS, size + 1, size - 1)))
         crc = int(pick(rng, (0, crc)))
     elif how == 4:
-        data, crc = bytes(int(pick(rng, (0, 1, 1 << 20, 1 << 27 if name in ("zstd", "lz4") else 1 << 16)))), 0
+        data, crc = bytes(int(pick(rng, (0, 1, 1 << 20, 1 << 25 if name in ("zstd", "lz4") else 1 << 16)))), 0
         size = int(pick(rng, (len(data), 100)))
     elif how == 5:
         data = blind(rng, data).data
