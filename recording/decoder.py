@@ -188,7 +188,10 @@ def _bind(
     if columns is None:
         return bindings
     by_name = {b.column: b for b in bindings}
-    return [by_name[c] for c in columns if c in by_name]
+    if not schema.names:
+        return [by_name[c] for c in columns if c in by_name]
+    # What a message does not name has no value in it.
+    return [by_name.get(c, Binding(c, "absent", "")) for c in columns]
 
 
 def _flatten(layout: Layout, decoder: Decoder) -> list[Binding]:
@@ -290,4 +293,5 @@ _READ: dict[str, Any] = {
     "technology": _technology,
     "text": _texts,
     "list": _list,
+    "absent": lambda layout, block, path: np.full(len(block), np.nan),
 }

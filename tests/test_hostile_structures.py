@@ -18,11 +18,11 @@ from marcha.ingest.anatomy import frame
 from marcha.ingest.workbook import MOST_CELLS, read_workbook
 from marcha.recording import MarchaError, UsageError
 from marcha.viz import domain_figures
-from marcha.viz.canvas import columns_of
 from marcha.viz.figures import figure
 
 from .cli_helpers import marcha
 from .contracts.exporter import example
+from .fuzz import mcap
 from .radio_samples import workbook
 
 GPX = """<?xml version="1.0"?><gpx version="1.1" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>{}
@@ -187,9 +187,22 @@ def test_a_topic_of_hundreds_of_signs_has_a_short_name_in_bids(tmp_path: Path) -
     assert len(about) == 2
 
 
-def test_a_declared_value_that_no_message_has_is_drawn_as_missing() -> None:
-    drawn = columns_of(pl.DataFrame({"shoe": [1.0, 2.0]}), ["shoe", "threshold"], [2.0, 1.0])
-    np.testing.assert_array_equal(drawn, [[2.0, np.nan], [4.0, np.nan]])
+def test_a_declared_value_that_no_message_has_is_missing(tmp_path: Path) -> None:
+    """Views, figures and exports took what the metadata declare for what the tables have."""
+    table = pl.DataFrame({"t_ns": np.arange(20) * 10**7, "shoe": np.arange(20.0), "mag": np.ones(20)})
+    with mr.create(tmp_path / "a.mcap") as out:
+        out.add_table("/estimate/a/detector", "marcha_msgs/msg/NamedValues", table)
+    data = (tmp_path / "a.mcap").read_bytes()
+    parts = mcap.records(data)
+    for part in parts:
+        part.body = part.body.replace(b'"mag"]', b'"sea"]')
+    (tmp_path / "a.mcap").write_bytes(mcap.whole(mcap._without_summary(parts)))
+    with mr.open(tmp_path / "a.mcap") as rec:
+        assert rec.channels["/estimate/a/detector"].columns == ("shoe", "sea")
+        found = rec.table("/estimate/a/detector")
+    np.testing.assert_array_equal(found["shoe"], np.arange(20.0))
+    assert found["sea"].is_nan().all()
+    assert marcha("view", tmp_path / "a.mcap", "--rrd", tmp_path / "a.rrd").code in (0, 3)
 
 
 # -- tables beside a log -----------------------------------------------------------------------------------

@@ -428,14 +428,9 @@ def thresholds_of(channel: ChannelLike) -> Iterator[Threshold]:
 
 
 def columns_of(table: pl.DataFrame, names: Sequence[str], factors: Sequence[float] = ()) -> Floats:
-    """Return columns as an (n, k) float64 array in the units they are shown in; null becomes NaN.
-
-    A column that no message of the table has is NaN too: a channel may declare more names than its messages give.
-    """
-    out = np.full((table.height, len(names)), math.nan)
+    """Return columns as an (n, k) float64 array in the units they are shown in; null becomes NaN."""
+    out = np.empty((table.height, len(names)))
     for i, name in enumerate(names):
-        if name not in table.columns:
-            continue
         column = table[name]
         if column.dtype != pl.Float64:
             column = column.cast(pl.Float64)
