@@ -253,6 +253,8 @@ def main() -> int:
                 print(
                     f"{command.name} after {after_s:.2f} of {lasts[command.name]:.2f} s: {wrong}", flush=True
                 )
+            if (k + 1) % 10 == 0:
+                print(f"{k + 1} × {given.signal}: {failures} failures", flush=True)
     print(f"{given.kills} × {given.signal}: {failures} failures")
     return int(failures > 0)
 
