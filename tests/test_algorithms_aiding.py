@@ -164,7 +164,7 @@ def test_without_aids_the_filter_is_the_sources_to_the_bit() -> None:
     def navigate() -> None:
         r = ring[s["released"] & (len(ring) - 1)]
         core.release(s, ring)
-        if not core.starts(s) and s["started"]:
+        if not core.starts(s, r) and s["started"]:
             strapdown.advance(s, r)
             iez9.predict(s, r)
             if r["still"]:

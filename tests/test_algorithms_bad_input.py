@@ -156,7 +156,7 @@ def test_a_wrong_rate_is_stated_with_the_right_one() -> None:
 
 def test_a_restless_start_is_stated() -> None:
     rows, _ = simulated()
-    rows[:250, 4:7] += 0.05 * np.sin(np.arange(250)[:, None] * [0.5, 0.7, 0.9])
+    rows[:400, 4:7] += 0.05 * np.sin(np.arange(400)[:, None] * [0.5, 0.7, 0.9])  # to the end of the rest
     assert "restless" in remarks(run("foot.9iez", rows)[1])
 
 

@@ -138,7 +138,7 @@ def test_a_way_without_steps_is_fatal() -> None:
 
 def test_a_lost_angle_taken_for_bias_is_fatal() -> None:
     """A gyroscope that stops at 250 °/s: fifteen states find a bias that no rest showed, nine know of none."""
-    rows, _ = simulated(laps=2, config="3030")
+    rows, _ = simulated(laps=3, config="3030")
     _, fifteen = run("foot.15iez-zaru", rows)
     assert remark(fifteen, "clipped")
     assert remark(fifteen, "inconsistent")

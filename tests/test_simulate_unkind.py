@@ -105,9 +105,12 @@ def test_a_lift_carries_a_standing_foot() -> None:
     assert np.abs(climbed - (walk.pos[:, 2] - walk.pos[0, 2])).max() < 0.01
 
 
-def test_a_lift_is_not_seen_as_the_documentation_says() -> None:
-    """A limit, not a promise: who mends it changes docs/estimators.md too."""
+def test_a_lift_is_not_in_the_estimate_and_the_run_says_so() -> None:
     walk = sim.walk("lift", seed=1)
-    result, _ = run("foot.9iez", rows_of(walk.t, *walk.measured()))
+    result, estimator = run("foot.9iez", rows_of(walk.t, *walk.measured()))
     upstairs = walk.still & (walk.pos[:, 2] > 2.9)
     assert abs(np.nanmedian(result["pose.pos_z"][upstairs])) < 0.3
+    (remark,) = [r for r in estimator.remarks() if r.kind == "carried"]
+    assert not remark.fatal
+    riding = walk.t[~walk.still & (np.abs(walk.gyr_b).max(axis=1) < 1e-9)]
+    assert riding[0] < float(remark.detail.split()[1]) < riding[0] + 3.0

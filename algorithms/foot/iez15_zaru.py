@@ -126,7 +126,7 @@ def feed_back(s: Any) -> None:
 @compiled
 def believe_rest(s: Any) -> None:
     """Write what the rest leaves open into P: of the tilt, and of the biases where their priors are 0."""
-    base.believe_rest(s, ATT)
+    base.believe_rest(s, ATT, VEL)
     for i in range(3):
         s.P[BIAS_GYR + i, BIAS_GYR + i] = max(s.P[BIAS_GYR + i, BIAS_GYR + i], s.rest.bias_variance)
 
@@ -134,7 +134,7 @@ def believe_rest(s: Any) -> None:
 @compiled
 def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
     r = core.release(s, ring)
-    if core.starts(s):
+    if core.starts(s, r):
         believe_rest(s)
     elif s.started:
         strapdown.advance(s, r)

@@ -11,7 +11,7 @@ from ..numerics.compiled import compiled, inlined
 from ..numerics.records import Fields, record_type
 from ..numerics.rotations import orthonormalize, turn_nav
 from ..parameters import meta
-from . import core
+from . import core, rest
 from .aiding import AIDS, AidedEstimator, AidingParams, aid
 from .estimator import FootEstimator
 from .parameters import FootParams, with_parts
@@ -189,7 +189,7 @@ def zero_velocity(s: Any, r: Any, n_considered: int) -> None:
 
 
 @compiled
-def believe_rest(s: Any, att: int) -> None:
+def believe_rest(s: Any, att: int, vel: int) -> None:
     """Write what the rest leaves open of the tilt into P: ``sigma_tilt``, and what ‖f‖ is off gravity.
 
     An accelerometer whose norm at rest is off has errors of that size across, too.
@@ -198,9 +198,17 @@ def believe_rest(s: Any, att: int) -> None:
         return
     a = s.rest.acc
     off = (math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2]) - s.gravity) / s.gravity
-    s.unknown_tilt = s.tilt * s.tilt + off * off
+    s.unknown_tilt = s.tilt * s.tilt
+    if not s.rest.stance:
+        s.unknown_tilt += off * off
+        off = 0.0
     for i in range(2):
-        s.P[att + i, att + i] = s.unknown_tilt
+        s.P[att + i, att + i] = s.unknown_tilt + off * off
+    if s.rest.stance:
+        for i in range(2):
+            s.P[att + i, att + i] += rest.STANCE_TILT * rest.STANCE_TILT
+        for i in range(3):
+            s.P[vel + i, vel + i] = rest.STANCE_SPEED * rest.STANCE_SPEED
 
 
 @inlined
@@ -217,10 +225,12 @@ def feed_back(s: Any, n_considered: int) -> None:
 @compiled
 def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
     r = core.release(s, ring)
-    if core.starts(s):
-        believe_rest(s, ATT)
+    if core.starts(s, r):
+        believe_rest(s, ATT, VEL)
         s.unknown_bias = s.rest.bias_variance
     elif s.started:
+        if s.rest.heard_out:
+            rest.hear_out(s)
         strapdown.advance(s, r)
         predict(s, r)
         if r.still:

@@ -146,8 +146,8 @@ def _advance(s: Any, r: Any) -> None:
 @compiled
 def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
     r = core.release(s, ring)
-    if core.starts(s):
-        base.believe_rest(s, base.ATT)
+    if core.starts(s, r):
+        base.believe_rest(s, base.ATT, base.VEL)
         _believe_rest(s)
         s.unknown_bias = s.rest.bias_variance  # of what is walked before the first long rest shows the bias
     elif s.started:
@@ -158,8 +158,10 @@ def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
     core.emit(s, r, out)
     core.emit_sigma(s, base.POS, base.VEL, base.ATT, out)
     if s.started:
+        # Its orientation filter knows neither the gyroscope's scale nor what a biased accelerometer hides of the tilt.
         for i in range(3):
-            out[core.SIGMA + 6 + i] = math.sqrt(max(0.0, s.orientation.P[i, i]))
+            own = math.sqrt(max(0.0, s.orientation.P[i, i]))
+            out[core.SIGMA + 6 + i] = max(out[core.SIGMA + 6 + i], own)
     core.emit_detector(r, core.AFTER_SIGMA, out)
 
 

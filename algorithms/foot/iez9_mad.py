@@ -13,7 +13,7 @@ from ..numerics.compiled import compiled, inlined
 from ..numerics.records import record_type
 from ..numerics.rotations import quat_of, set_quat
 from ..parameters import meta
-from . import core
+from . import core, rest
 from . import iez9 as base
 from .estimator import FootEstimator
 from .parameters import with_parts
@@ -188,11 +188,13 @@ def _take_over(s: Any) -> None:
 @compiled
 def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
     r = core.release(s, ring)
-    if core.starts(s):
+    if core.starts(s, r):
         _take_over(s)
-        base.believe_rest(s, base.ATT)
+        base.believe_rest(s, base.ATT, base.VEL)
         s.unknown_bias = s.rest.bias_variance
     elif s.started:
+        if s.rest.heard_out:
+            rest.hear_out(s)
         _advance(s, r)
         base.predict(s, r)
         if r.still:

@@ -19,7 +19,7 @@ FootNaiveParams = with_parts(FootParams, "FootNaiveParams", __name__)
 @compiled
 def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
     r = core.release(s, ring)
-    if not core.starts(s) and s.started:
+    if not core.starts(s, r) and s.started:
         strapdown.advance(s, r)
     core.emit(s, r, out)
     core.emit_detector(r, core.SIGMA, out)

@@ -75,6 +75,14 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
                 fatal=True,
             )
         )
+    elif s.rest.stance:
+        result.append(
+            Remark(
+                "moving_start",
+                f"it begins in motion: started in the stance at {start:.2f} s and levelled by the "
+                f"{s.rest.elapsed:.2f} s of it; the gyroscope's bias is not known, the heading may drift",
+            )
+        )
     elif start > 0.5:
         wanted = f"{p.init_s:g} s" if p.init == "fixed" else f"{min(p.init_min_s, p.init_s):g} s"
         result.append(
@@ -89,7 +97,7 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
     spread = math.sqrt(s.rest.spread / s.rest.count)
     if s.rest.adaptive and s.rest.quietest < math.inf:
         spread = math.sqrt(max(0.0, s.rest.quietest))
-    elif s.rest.adaptive:
+    elif s.rest.adaptive and not s.rest.stance:
         result.append(
             Remark(
                 "short_rest",
@@ -117,7 +125,7 @@ def remarks(s: Any, p: Any, rate_hz: float, is_corrected: bool = True) -> list[R
                 fatal=True,
             )
         )
-    elif abs(norm - p.gravity) > 0.02 * p.gravity:
+    elif abs(norm - p.gravity) > 0.02 * p.gravity and not s.rest.stance:
         result.append(
             Remark(
                 "gravity_norm",
@@ -228,6 +236,15 @@ def verdict(s: Any, p: Any) -> list[Remark]:
                 "not_gait",
                 f"{v.n_landings} stances make only {s.steps.count} steps: this is no walk, or the detector "
                 f"{p.detector} breaks its stances; the position between them is doubtful",
+            )
+        )
+    if v.carried_at > 0.0:
+        result.append(
+            Remark(
+                "carried",
+                f"at {v.carried_at:.1f} s the foot stood without turning, and ‖f‖ was off by {v.carried_by:.2f} "
+                "m/s² for more than half a second: a lift, or another floor that moves; its way is not in the "
+                "estimate (barometer=true measures the height)",
             )
         )
     result += _against_the_gait(s)

@@ -10,7 +10,11 @@ A foot that is about to walk turns before it moves: taken for a bias, that turns
 therefore the mean rate of the rest's half seconds, each weighted by the inverse fourth power of its variance,
 and its variance follows from theirs and the length (:func:`bias_of`). Of a rest of less than half a second
 nothing is known but that it turns by no more than ``rest_gyr``. With a prior (``rest_bias_sigma``) the bias is
-the posterior mean: what a restless rest says of it counts little.
+the posterior mean: what a restless rest says of it counts little. A rest that goes on beyond ``init_s`` is
+listened to until the foot moves.
+
+Where a stride's time has passed without a rest, the walk had begun before the recording did: an adaptive start then
+takes the first stance that the detector finds (:func:`watch_stance`), with what such a stance leaves open.
 """
 
 from __future__ import annotations
@@ -32,6 +36,15 @@ LEAST_SPREAD = 1e-4
 """rad/s: no sensor is quieter; keeps weights finite."""
 BIAS_CHANGE = 5e-4
 """rad/s: what a rest cannot show, the bias' change from rest to walk (0.03 °/s: instability of industrial MEMS)."""
+
+STRIDE_S = 1.0
+"""So long without a rest: the walk had begun before the recording did."""
+STANCE_S = 0.04
+"""Shortest stance that such a walk starts from."""
+STANCE_TILT = 0.1
+"""rad: the force on a foot that rolls through a stance is off the vertical by about so much, in running."""
+STANCE_SPEED = 0.1
+"""m/s: a foot moves on by about so much in a stance."""
 
 PIECE = record_type(
     ("elapsed", "f8"),
@@ -70,6 +83,13 @@ REST = record_type(
     ("weighted", "f8", (3,)),  # weighted sum of their mean rates
     ("sway", "f8"),  # weighted sum of the variances of their pieces' means, an axis, rad²/s²
     ("bias_variance", "f8"),  # of an axis' bias after the rest, rad²/s²; 0 where it is not known
+    ("lasts", "?"),  # it was long enough and still goes on
+    ("heard_out", "?"),  # the foot has moved since: what the whole rest says is not taken over yet
+    ("stance", "?"),  # taken from a stance: there was no rest
+    ("swung", "?"),  # the detector has found a swing: what does not is no gait
+    ("stance_s", "f8"),  # of the stance in progress
+    ("stance_count", "i8"),
+    ("stance_acc", "f8", (3,)),  # its mean force, b
 )
 
 
@@ -138,7 +158,8 @@ def _weigh(rest: Any) -> None:
             sway += off * off / (3 * (PIECES - 1))
     variance = max(variance, 0.0)
     rest.quietest = min(rest.quietest, variance)
-    weight = 1.0 / (variance + LEAST_SPREAD * LEAST_SPREAD) ** 4
+    square = (variance + LEAST_SPREAD * LEAST_SPREAD) * (variance + LEAST_SPREAD * LEAST_SPREAD)
+    weight = 1.0 / (square * square)
     rest.weights += weight
     rest.weights_squared += weight * weight
     rest.sway += weight * sway
@@ -158,7 +179,9 @@ def bias_of(rest: Any, bias: Any) -> None:
         for i in range(3):
             bias[i] = rest.weighted[i] / rest.weights
     else:
-        variance = rest.gyr_max * rest.gyr_max / 3.0
+        variance = (
+            rest.gyr_max * rest.gyr_max / 3.0 if not rest.stance else rest.bias_max * rest.bias_max / 3.0
+        )
         for i in range(3):
             bias[i] = rest.gyr[i]
     if rest.bias_prior > 0.0:
@@ -175,6 +198,11 @@ def watch(rest: Any, r: Any, k: int, time: float) -> bool:
     if rest.index >= 0:
         if not _is_near(rest, r):
             rest.moved += 1
+            rest.heard_out = rest.lasts
+            rest.lasts = False
+        elif rest.lasts:
+            rest.elapsed += r.dt
+            _note(rest, r)
         return False
     dt = r.dt
     if rest.count > 0 and (dt > LONGEST_PAUSE_S or not _is_near(rest, r)):
@@ -223,7 +251,49 @@ def watch(rest: Any, r: Any, k: int, time: float) -> bool:
         rest.count = 0  # a steady turn, not a rest
         return False
     rest.index = k
+    rest.lasts = rest.adaptive
     return True
+
+
+@compiled
+def watch_stance(rest: Any, r: Any, k: int, time: float) -> None:
+    """Take the sample ``k`` with its decision; without a rest, let the walk start in the first long enough stance.
+
+    The rest is looked for ahead of the decisions, by the detector's latency: one in progress goes before.
+    """
+    if not r.still:
+        rest.swung = True
+        rest.stance_s = 0.0
+        rest.stance_count = 0
+        return
+    rest.stance_s += r.dt
+    rest.stance_count += 1
+    for i in range(3):
+        rest.stance_acc[i] += (r.acc[i] - rest.stance_acc[i]) / rest.stance_count
+    is_stance = rest.swung and time >= STRIDE_S and rest.stance_s >= STANCE_S
+    if not is_stance or rest.elapsed + 5e-10 >= rest.shortest:
+        return
+    rest.stance = True
+    rest.index = k
+    rest.begin = time - rest.stance_s
+    rest.elapsed = rest.stance_s
+    rest.count = rest.stance_count
+    rest.spread = 0.0
+    rest.quietest = math.inf
+    for i in range(3):
+        rest.acc[i] = rest.stance_acc[i]
+        rest.gyr[i] = 0.0  # a turning foot says nothing of the bias
+
+
+@compiled
+def hear_out(s: Any) -> None:
+    """Take over the bias that the whole of a long rest shows, for a filter that estimates none itself."""
+    s.rest.heard_out = False
+    if s.rest.takes_bias:
+        bias_of(s.rest, s.bias_gyr)
+        s.unknown_bias = s.rest.bias_variance
+        for i in range(3):
+            s.verdict.first_bias[i] = s.bias_gyr[i]
 
 
 @compiled

@@ -75,7 +75,7 @@ def _navigate(s: Any, ring: Any, out: FloatArray, log: Any) -> None:
     r = core.release(s, ring)
     log.stage = NOT_STARTED
     log.n_updates = 0
-    if core.starts(s):
+    if core.starts(s, r):
         log.stage = START
         base.believe_rest(s)
     elif s.started:

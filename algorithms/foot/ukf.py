@@ -10,7 +10,7 @@ from ..numerics import kalman, strapdown
 from ..numerics.compiled import compiled
 from ..numerics.records import record_type
 from ..parameters import meta
-from . import core
+from . import core, rest
 from . import iez9 as base
 from .estimator import FootEstimator
 from .iez9 import ATT, POS, VEL, N
@@ -153,10 +153,12 @@ def predict(s: Any, r: Any) -> None:
 @compiled
 def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
     r = core.release(s, ring)
-    if core.starts(s):
-        base.believe_rest(s, ATT)
+    if core.starts(s, r):
+        base.believe_rest(s, ATT, VEL)
         s.unknown_bias = s.rest.bias_variance
     elif s.started:
+        if s.rest.heard_out:
+            rest.hear_out(s)
         for i in range(3):
             s.step_force[i] = s.acc_n[i]
         strapdown.advance(s, r)
