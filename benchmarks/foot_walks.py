@@ -152,8 +152,8 @@ def _squared(walk: Walk, t: np.ndarray, p: np.ndarray, sigma: np.ndarray) -> flo
 
 
 def _row(walk: Walk, score: Score) -> str:
-    said = ", ".join(f"**{r.kind}**" if r.fatal else r.kind for r in score.remarks)
-    return f"| {walk.name} | {score.steps} | {score.way_m:.1f} | {score.height_m:+.2f} | {score.error_m:.3f} | {said} |"
+    kinds = ", ".join(f"**{r.kind}**" if r.fatal else r.kind for r in score.remarks)
+    return f"| {walk.name} | {score.steps} | {score.way_m:.1f} | {score.height_m:+.2f} | {score.error_m:.3f} | {kinds} |"
 
 
 def promise(walk: Walk, score: Score) -> str:
@@ -207,7 +207,7 @@ def main() -> int:
         parser.error(f"{options.data / 'foot'}: no such folder; name the data by --data or MARCHA_DATA")
     broken = 0
     with tempfile.TemporaryDirectory() as temporary:
-        found = [
+        recordings = [
             w
             for w in walks(options.data / "foot", options.scratch or Path(temporary))
             if options.only in w.name
