@@ -153,7 +153,8 @@ def _squared(walk: Walk, t: np.ndarray, p: np.ndarray, sigma: np.ndarray) -> flo
 
 def _row(walk: Walk, score: Score) -> str:
     kinds = ", ".join(f"**{r.kind}**" if r.fatal else r.kind for r in score.remarks)
-    return f"| {walk.name} | {score.steps} | {score.way_m:.1f} | {score.height_m:+.2f} | {score.error_m:.3f} | {kinds} |"
+    figures = f"{score.steps} | {score.way_m:.1f} | {score.height_m:+.2f} | {score.error_m:.3f}"
+    return f"| {walk.name} | {figures} | {kinds} |"
 
 
 def promise(walk: Walk, score: Score) -> str:
