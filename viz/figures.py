@@ -250,7 +250,8 @@ def _one(fig: Figure, walk: _Walk) -> None:
         ax = left.subplots()
         _plan(ax, walk)
         left.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
-        panels = [_heights, _signals, *([_errors] if walk.with_errors else [])]
+        sensed = any("acc_x" in c.columns or c.schema.endswith("/Stance") for c in walk.rec.channels.values())
+        panels = [_heights, *([_signals] if sensed else []), *([_errors] if walk.with_errors else [])]
     axes = signals.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for draw, ax in zip(panels, axes, strict=True):
         _time(ax, draw, walk)
@@ -369,7 +370,8 @@ def _errors(ax: Axes, walk: _Walk) -> None:
             top = max(top, float(far.max())) if track in inside else top
         if topic := _position_sigma(walk.rec, run):
             table = walk.rec.table(topic)
-            sigma = np.sqrt(np.sum(table.select(POSITION_SIGMA).to_numpy() ** 2, axis=1))
+            axes = table.select(POSITION_SIGMA).to_numpy()  # a phone says nothing of the height: NaN
+            sigma = np.where(np.isfinite(axes).any(axis=1), np.sqrt(np.nansum(axes**2, axis=1)), np.nan)
             t, s = _thin(walk.seconds(table["t_ns"].to_numpy()), sigma)
             ax.fill_between(t, 0.0, s, color=track.color, alpha=0.2, linewidth=0)
             top = max(top, float(np.nanmax(sigma, initial=0.0))) if track in inside else top
