@@ -28,7 +28,11 @@ from marcha.viz.screenshot import Screenshot, screenshots
 IMAGES = Path(__file__).parent / "images"
 SENSOR = "/foot/imu2"
 FILTERS = ("foot.9iez", "foot.15iez-zaru", "foot.naive")
-DETECTORS = ("c1c2c3=foot.9iez", "shoe=foot.9iez[detector=shoe]", "pitch=foot.9iez[detector=pitch]")
+DETECTORS = (
+    "c1c2c3=foot.9iez[detector=c1c2c3]",
+    "shoe=foot.9iez[detector=shoe]",
+    "pitch=foot.9iez[detector=pitch]",
+)
 FRAME = 36
 """Height of the window's own bar, pixels."""
 
