@@ -43,9 +43,12 @@ class Where:
             None is named, or two.
         """
         from ..recording.errors import UsageError
+        from ..recording.files import require_other
 
         if self.in_place == (self.output is not None):
             raise UsageError("annotate: give either -o NEW.mcap or --in-place")
+        if self.output is not None:
+            require_other(self.output, [rec.path])
         return rec.path if self.output is None else self.output
 
     @property

@@ -9,6 +9,7 @@ from typing import Any
 
 from ..recording import Recording
 from ..recording.errors import UsageError
+from ..recording.files import require_other
 from ..recording.options import options_of
 from ..recording.plugins import plugins
 from .contract import Exporter
@@ -52,11 +53,12 @@ def export(
     Raises
     ------
     UsageError
-        Unknown exporter or option.
+        Unknown exporter or option, or ``path`` is the recording itself.
     OutputExists
         ``path`` exists and ``overwrite`` is false.
     """
     chosen = _exporter(to)
+    require_other(path, [rec.path])
     return chosen().export(
         rec,
         Path(path),

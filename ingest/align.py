@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from .. import recording as mr
 from ..recording.errors import MarchaError, UsageError
+from ..recording.files import require_other
 from .anatomy import cluster_attitude
 from .clockfit import ClockFit, FloatArray, Pair, from_events, from_rates, stated_fit, turn_rate
 from .leg import JOINTS, MARKERS_TOPIC, marker_names
@@ -225,6 +226,7 @@ def _write(
         int(shifted(np.array([c.start_ns]))[0]) for n, c in rec.channels.items() if n in moved and c.count
     ]
     later = max(0, -min(starts, default=0))
+    require_other(out, [rec.path])
     with mr.create(out, overwrite=overwrite) as written:
         for name, channel in rec.channels.items():
             if name.startswith("/annotation/"):

@@ -13,7 +13,7 @@ import polars as pl
 
 from .. import recording as mr
 from ..recording.errors import MarchaError, OutputExists, UsageError
-from ..recording.files import as_unicode
+from ..recording.files import as_unicode, require_other
 from ..recording.provenance import provenance
 from ..recording.threads import Prefetch, helpers
 from . import registry
@@ -121,8 +121,7 @@ def convert(
         format = format or (mapped if len(sources) == 1 else None)
     if out.is_dir():
         raise MarchaError(f"{out}: is a folder; give the name of the recording to write")
-    if out.exists() and any(s.exists() and out.samefile(s) for s in sources):
-        raise UsageError(f"{out}: is the source itself; give the recording another name")
+    require_other(out, sources)
     if out.exists() and not overwrite:
         raise OutputExists(out)
     with contextlib.ExitStack() as stack:

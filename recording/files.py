@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import stat
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
 import msgspec
 
-from .errors import MarchaError
+from .errors import MarchaError, UsageError
 
 MOST_TEXT_BYTES = 1 << 24
 """A configuration, mapping or table of labels that is larger is none."""
@@ -28,6 +29,25 @@ def require_regular(path: Path) -> None:
         return
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise MarchaError(f"{path}: is a pipe, socket or device; write its content to a file and give that")
+
+
+def require_other(out: Path | str, inputs: Iterable[Path]) -> None:
+    """Refuse an output that is one of the inputs, by whatever name: an input is never changed in place.
+
+    Raises
+    ------
+    UsageError
+        It is one.
+    """
+    for path in inputs:
+        try:
+            same = Path(out).samefile(path)
+        except OSError:  # one of them is not there
+            continue
+        if same:
+            raise UsageError(
+                f"{out}: is the input itself; an input is never changed in place, give another name"
+            )
 
 
 def as_unicode(name: Path | str) -> str:

@@ -14,6 +14,7 @@ from .annotations import EVENT
 from .changes import HISTORY, Change
 from .errors import UsageError
 from .events import SIDECAR, TABLE, VOCABULARY
+from .files import require_other
 from .joins import JoinedPart, cut_history, history_text, joined_history
 from .provenance import source_file
 from .reader import Recording
@@ -66,6 +67,7 @@ def cut(rec: Recording, out: Path | str, start_ns: int, end_ns: int, *, overwrit
     UsageError
         There is nothing in that time, or a channel is of a type that cannot be written in part.
     """
+    require_other(out, [rec.path])
     chosen = Selection(start_ns=start_ns, end_ns=end_ns)
     topics = [t for t in selected_topics(rec, chosen) if rec.channels[t].schema != EVENT]
     if start_ns > rec.end_ns or end_ns <= rec.start_ns:
@@ -127,6 +129,7 @@ def merge(
             f"merge: {len(recs)} recordings, {len(offsets)} offsets, {len(starts)} prefixes: "
             "as many of each, two at least"
         )
+    require_other(out, [rec.path for rec in recs])
     seen: dict[str, Path] = {}
     for rec, start in zip(recs, starts, strict=True):
         for topic, channel in rec.channels.items():
@@ -182,6 +185,7 @@ def anonymize(
     overwrite : bool
         Whether ``out`` may be replaced.
     """
+    require_other(out, [rec.path])
     removed, left = [f"dates: times begin at 0 instead of {rec.start_ns} ns"], []
     addresses: dict[str, str] = {}
     topics = []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -11,7 +10,8 @@ from typing import Any, Literal
 from ..algorithms.calibration import Calibration
 from ..recording import Recording
 from ..recording import open as open_recording
-from ..recording.errors import OutputExists, UsageError
+from ..recording.errors import OutputExists
+from ..recording.files import require_other
 from ..recording.provenance import hash_file
 from ..recording.threads import give_back_memory
 from .clock import Clock
@@ -113,10 +113,7 @@ def replay(
     )
     target = Path(out) if out is not None else None
     if target is not None:
-        if rec is not None and target.exists() and os.path.samefile(target, rec.path):
-            raise UsageError(
-                f"{target}: is the input itself; a recording is never changed in place, give another name"
-            )
+        require_other(target, [rec.path] if rec is not None else [])
         if target.exists() and not overwrite:
             raise OutputExists(target)
     if rec is not None and metrics:

@@ -259,3 +259,34 @@ def test_directions_too_long_to_square_give_no_attitude() -> None:
     for found in (frame(z, long), frame(z, long, along_x=True)):
         assert np.isnan(found[0]).any()
         np.testing.assert_allclose(np.linalg.det(found[1]), 1.0, atol=1e-12)
+
+
+# -- outputs -----------------------------------------------------------------------------------------------
+
+ONTO_ITSELF = (
+    ("replay", "-e", "foot.naive"),
+    ("cut", "--start", "0.1"),
+    ("anonymize",),
+    ("merge", "OTHER", "--prefix", "/a", "--prefix", "/b"),
+    ("annotate", "add", "--label", "x", "--from", "0.1"),
+    ("export", "--to", "mcap"),
+    ("export", "--to", "csv"),
+    ("export", "--to", "matlab"),
+)
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "link.mcap", "hard.mcap"])
+@pytest.mark.parametrize("command", ONTO_ITSELF, ids=" ".join)
+def test_no_command_replaces_its_input(tmp_path: Path, command: tuple[str, ...], name: str) -> None:
+    path = example(tmp_path / "a.mcap", 200)
+    other = example(tmp_path / "b.mcap", 20)
+    (tmp_path / "link.mcap").symlink_to(path)
+    (tmp_path / "hard.mcap").hardlink_to(path)
+    before = path.read_bytes()
+    at = 2 if command[0] == "annotate" else 1
+    more = [other if a == "OTHER" else a for a in command[at:]]
+    done = marcha(*command[:at], path, *more, "-o", tmp_path / name, "--force")
+    assert done.code == 2, done.err
+    assert "is the input itself" in done.err.splitlines()[-1]
+    assert path.read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "b.mcap", "hard.mcap", "link.mcap"]

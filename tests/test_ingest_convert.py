@@ -162,7 +162,7 @@ def test_output_is_never_overwritten_unasked(walk: Path, tmp_path: Path) -> None
 
 def test_output_that_is_the_source(walk: Path) -> None:
     before = walk.read_bytes()
-    with pytest.raises(UsageError, match="source itself"):
+    with pytest.raises(UsageError, match="input itself"):
         convert(walk, walk, overwrite=True)
     assert walk.read_bytes() == before
 
