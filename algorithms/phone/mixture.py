@@ -1,9 +1,9 @@
 """The track as a mixture of Gaussian hypotheses: steps carry it, fixes weigh and correct it.
 
 State of a hypothesis: position east, north (m), heading correction (rad, added to the steps' headings),
-logarithm of the length's scale, the slow error of the fixes, a Gauss–Markov process in units of what each fix states
-(so that a fix of 20 m is not off by the error of one of 600 m before it), and the rate at which the headings drift
-(rad/s: the gyroscope's bias about the vertical). An unknown initial
+logarithm of the length's scale, the slow error of the fixes (m), a Gauss–Markov process that begins anew where fixes
+of another accuracy come from another source (:data:`OTHER_SOURCE`), and the rate at which the headings drift (rad/s:
+the gyroscope's bias about the vertical). An unknown initial
 heading is a ring of hypotheses, not a linearization. A fix is an inlier or an outlier with stated
 probabilities; each hypothesis is corrected by its inlier's share (probabilistic data association, Bar-Shalom), so
 that a fix far off moves nothing and a doubtful one a little, with the covariance to match.
@@ -19,6 +19,8 @@ from .attitude import wrap
 
 N = 7
 HYPOTHESES = 12
+OTHER_SOURCE = 3.0
+"""Factor between stated accuracies from which on fixes come from another source (cells instead of satellites)."""
 
 FIELDS: list[tuple[Any, ...]] = [
     ("hyp", "i8"),  # number of hypotheses that are alive
@@ -37,6 +39,7 @@ FIELDS: list[tuple[Any, ...]] = [
     ("q_drift", "f8"),  # growth of the drift, rad/s per √s
     ("gm_share", "f8"),  # share of the slow error in a fix's variance
     ("gm_tau", "f8"),
+    ("gm_sd", "f8"),  # stationary standard deviation of the slow error now modelled (m)
     ("outlier", "f8"),
     ("mean", "f8", (4,)),  # mixture: east, north, heading correction, scale
     ("cov", "f8", (4,)),  # east, east-north, north; variance of the heading correction
@@ -56,7 +59,6 @@ def configure(
         s["hx"][h, 2] = turn - 2 * math.pi if turn > math.pi else turn
         s["hP"][h, 2, 2] = sigma_heading**2 if heading_known else (math.pi / count) ** 2
         s["hP"][h, 3, 3] = sigma_scale**2
-        s["hP"][h, 4, 4] = s["hP"][h, 5, 5] = 1.0
         s["hP"][h, 6, 6] = sigma_drift**2
         s["hw"][h] = 1.0 / count
 
@@ -136,10 +138,10 @@ def age(s: Any, t_ns: int) -> None:
         for j in range(N):
             s.hP[h, j, 2] += dt * s.hP[h, j, 6]
         s.hP[h, 6, 6] += dt * s.q_drift**2
-    if s.gm_tau == 0.0:
+    if s.gm_sd == 0.0:
         return
     keep = math.exp(-dt / s.gm_tau)
-    add = 1.0 - keep * keep
+    add = s.gm_sd**2 * (1.0 - keep * keep)
     for h in range(s.hyp):
         for i in range(4, 6):
             s.hx[h, i] *= keep
@@ -156,23 +158,33 @@ def fix(s: Any, t_ns: int, east: float, north: float, sd: float) -> None:
     age(s, t_ns)
     s.fixes += 1
     slow, white = sd * math.sqrt(s.gm_share), sd * sd * (1.0 - s.gm_share)
+    if s.located == 0 or slow > OTHER_SOURCE * s.gm_sd or slow * OTHER_SOURCE < s.gm_sd:
+        s.gm_sd = slow
+        for h in range(s.hyp):
+            for i in range(4, 6):
+                s.hx[h, i] = 0.0
+                for j in range(N):
+                    s.hP[h, i, j] = s.hP[h, j, i] = 0.0
+                s.hP[h, i, i] = slow * slow
+    else:
+        s.gm_sd += 0.2 * (slow - s.gm_sd)
     if s.located == 0:
         s.located = 1
         for h in range(s.hyp):  # the walked way so far is about an unknown origin
             s.hP[h, 0, 0] += 1e8
             s.hP[h, 1, 1] += 1e8
         for h in range(s.hyp):
-            _correct(s, h, east, north, slow, white, 1.0)
+            _correct(s, h, east, north, white, 1.0)
         summarize(s)
         return
     total, outside = 0.0, 0.0
     for h in range(s.hyp):
-        p_in, p_out = _likelihoods(s, h, east, north, slow, white)
+        p_in, p_out = _likelihoods(s, h, east, north, white)
         share = (1.0 - s.outlier) * p_in / ((1.0 - s.outlier) * p_in + s.outlier * p_out)
         s.hw[h] *= (1.0 - s.outlier) * p_in + s.outlier * p_out
         total += s.hw[h]
         outside += s.hw[h] * (1.0 - share)
-        _correct(s, h, east, north, slow, white, share)
+        _correct(s, h, east, north, white, share)
     s.outliers += outside / total if total > 0.0 else 1.0
     for h in range(s.hyp):
         s.hw[h] = s.hw[h] / total if total > 0.0 else 1.0 / s.hyp
@@ -181,10 +193,10 @@ def fix(s: Any, t_ns: int, east: float, north: float, sd: float) -> None:
 
 
 @compiled
-def _innovation(s: Any, h: int, g: float, white: float) -> tuple[float, float, float]:
-    a = s.hP[h, 0, 0] + 2.0 * g * s.hP[h, 0, 4] + g * g * s.hP[h, 4, 4] + white
-    b = s.hP[h, 0, 1] + g * (s.hP[h, 0, 5] + s.hP[h, 4, 1]) + g * g * s.hP[h, 4, 5]
-    c = s.hP[h, 1, 1] + 2.0 * g * s.hP[h, 1, 5] + g * g * s.hP[h, 5, 5] + white
+def _innovation(s: Any, h: int, white: float) -> tuple[float, float, float]:
+    a = s.hP[h, 0, 0] + 2.0 * s.hP[h, 0, 4] + s.hP[h, 4, 4] + white
+    b = s.hP[h, 0, 1] + s.hP[h, 0, 5] + s.hP[h, 4, 1] + s.hP[h, 4, 5]
+    c = s.hP[h, 1, 1] + 2.0 * s.hP[h, 1, 5] + s.hP[h, 5, 5] + white
     return a, b, c
 
 
@@ -196,21 +208,21 @@ def _density(x: float, y: float, a: float, b: float, c: float) -> float:
 
 
 @compiled
-def _likelihoods(s: Any, h: int, east: float, north: float, g: float, white: float) -> tuple[float, float]:
+def _likelihoods(s: Any, h: int, east: float, north: float, white: float) -> tuple[float, float]:
     """Densities of a fix as inlier, and as outlier (the same with 50 m more an axis)."""
-    x, y = east - s.hx[h, 0] - g * s.hx[h, 4], north - s.hx[h, 1] - g * s.hx[h, 5]
-    a, b, c = _innovation(s, h, g, white)
+    x, y = east - s.hx[h, 0] - s.hx[h, 4], north - s.hx[h, 1] - s.hx[h, 5]
+    a, b, c = _innovation(s, h, white)
     return _density(x, y, a, b, c), _density(x, y, a + 2500.0, b, c + 2500.0) + 1e-30
 
 
 @compiled
-def _correct(s: Any, h: int, east: float, north: float, g: float, white: float, share: float) -> None:
+def _correct(s: Any, h: int, east: float, north: float, white: float, share: float) -> None:
     """Kalman update by the inlier's share β: x + β K ν, P − β K S Kᵀ + β (1 − β) K ν νᵀ Kᵀ."""
-    x, y = east - s.hx[h, 0] - g * s.hx[h, 4], north - s.hx[h, 1] - g * s.hx[h, 5]
-    a, b, c = _innovation(s, h, g, white)
+    x, y = east - s.hx[h, 0] - s.hx[h, 4], north - s.hx[h, 1] - s.hx[h, 5]
+    a, b, c = _innovation(s, h, white)
     det = a * c - b * b
     for i in range(N):
-        u, v = s.hP[h, i, 0] + g * s.hP[h, i, 4], s.hP[h, i, 1] + g * s.hP[h, i, 5]
+        u, v = s.hP[h, i, 0] + s.hP[h, i, 4], s.hP[h, i, 1] + s.hP[h, i, 5]
         s.work[0, i], s.work[1, i] = (u * c - v * b) / det, (v * a - u * b) / det
     for i in range(N):
         s.hx[h, i] += share * (s.work[0, i] * x + s.work[1, i] * y)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from typing import Any, ClassVar, NamedTuple
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from ..contract import ALL_COLUMNS, Context, FloatArray, IntArray, Message, PlainEstimator, Remark, Result
 from ..numerics.compiled import compiled
 from . import geodesy
+from .mixture import OTHER_SOURCE
 from .pdr import FIX, POSE, SIGMA, STATE, PhoneFused, PhoneFusedParams, drift_sd
 from .steps import STEP
 
@@ -94,23 +97,25 @@ def _pass(
 ) -> tuple[FloatArray, FloatArray]:
     """Return one linear smoother about ``ref``."""
     n = len(dt)
-    slow = math.sqrt(p.gnss_slow_share) * walk.fix[:, 2]  # the slow error is in units of what each fix states
+    slow, anew = _sources(walk.fix[:, 2] * math.sqrt(p.gnss_slow_share))
     x = ref[0].copy()
     x[3:] = 0.0
-    P = np.diag([1e8, 1e8, 2.0, p.sigma_scale**2, 1.0, 1.0, p.sigma_drift**2])
+    P = np.diag([1e8, 1e8, 2.0, p.sigma_scale**2, slow[0] ** 2, slow[0] ** 2, p.sigma_drift**2])
     xs, Ps = np.zeros((n, N)), np.zeros((n, N, N))
     xp, Pp, Fs = np.zeros((n, N)), np.zeros((n, N, N)), np.zeros((n, N, N))
     H = np.zeros((2, N))
-    H[0, 0] = H[1, 1] = 1.0
+    H[0, 0] = H[1, 1] = H[0, 4] = H[1, 5] = 1.0
     for k in range(n):
-        F, Q, f = _model(walk.move[k], dt[k], ref[k - 1] if k else ref[0], p)
+        F, Q, f = _model(walk.move[k], dt[k], ref[k - 1] if k else ref[0], slow[k], p)
+        if anew[k]:  # another source of fixes: its slow error has nothing to do with the one before
+            F[4:6], f[4:6] = 0.0, 0.0
+            Q[4, 4] = Q[5, 5] = slow[k] ** 2
         if k:
             x = f + F @ (x - ref[k - 1])
             P = F @ P @ F.T + Q
         xp[k], Pp[k], Fs[k] = x, P, F
         if inlier[k] > 1e-6:
             sd = walk.fix[k, 2]
-            H[0, 4] = H[1, 5] = slow[k]
             R = np.eye(2) * (sd * sd * (1 - p.gnss_slow_share) / inlier[k])
             S = H @ P @ H.T + R
             K = np.linalg.solve(S, H @ P).T
@@ -126,8 +131,30 @@ def _pass(
     return xs, Ps
 
 
+def _sources(sd: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Return at every event the slow error's deviation (m), and whether another source of fixes begins there.
+
+    A source's is the median of its fixes' (``sd``, NaN at steps); see :data:`.mixture.OTHER_SOURCE`.
+    """
+    slow, anew = np.zeros(len(sd)), np.zeros(len(sd), bool)
+    fixes = np.flatnonzero(np.isfinite(sd))
+    starts: list[int] = []
+    level = 0.0
+    for k in fixes:
+        if not starts or sd[k] > OTHER_SOURCE * level or sd[k] * OTHER_SOURCE < level:
+            starts.append(int(k))
+            level = float(sd[k])
+        level += 0.2 * (float(sd[k]) - level)
+    for first, end in itertools.pairwise([*starts, len(sd)]):
+        slow[first:end] = np.nanmedian(sd[first:end])
+    if starts:
+        slow[: starts[0]] = slow[starts[0]]
+        anew[starts[1:]] = True
+    return slow, anew
+
+
 def _model(
-    move: FloatArray, dt: float, state: FloatArray, p: PhoneFusedParams
+    move: FloatArray, dt: float, state: FloatArray, slow: float, p: PhoneFusedParams
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return Jacobian, noise and value of the motion to the next event, linearized at ``state``."""
     F, Q = np.eye(N), np.zeros((N, N))
@@ -144,7 +171,7 @@ def _model(
     Q[0, 1] = Q[1, 0] = (along - across) * c * w
     if move[0] > 0:
         Q[2, 2], Q[3, 3] = math.radians(p.sigma_turn_deg) ** 2, 0.003**2
-    Q[4, 4] = Q[5, 5] = 1 - keep * keep
+    Q[4, 4] = Q[5, 5] = slow**2 * (1 - keep * keep)
     Q[6, 6] = dt * 2e-5**2
     value = state.copy()
     value[0] += r * c
@@ -160,11 +187,9 @@ def _inliers(
     """Return each fix's probability of being one, from its residual against the smoothed track without it."""
     out = np.zeros(len(state))
     for k in np.flatnonzero(np.isfinite(walk.fix[:, 0])):
-        slow = math.sqrt(p.gnss_slow_share) * walk.fix[k, 2]
-        r = walk.fix[k, :2] - state[k, :2] - slow * state[k, 4:6]
+        r = walk.fix[k, :2] - state[k, :2] - state[k, 4:6]
         H = np.zeros((2, N))
-        H[0, 0] = H[1, 1] = 1.0
-        H[0, 4] = H[1, 5] = slow
+        H[0, 0] = H[1, 1] = H[0, 4] = H[1, 5] = 1.0
         S = H @ cov[k] @ H.T
         R = np.eye(2) * walk.fix[k, 2] ** 2 * (1 - p.gnss_slow_share)
         if used[k] > 1e-6:  # take its own share out of the smoothed residual: S R⁻¹ is its leverage

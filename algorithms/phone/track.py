@@ -272,7 +272,6 @@ def _use_fix(s: Any, t_ns: int) -> None:
             s.hx[h, 2] = attitude.wrap(2.0 * math.pi * h / s.hyp)
             s.hP[h, 2, 2], s.hP[h, 3, 3] = (math.pi / s.hyp) ** 2, 0.01
             s.hP[h, 6, 6] = 1e-5
-            s.hP[h, 4, 4] = s.hP[h, 5, 5] = 1.0
             s.hw[h] = 1.0 / s.hyp
         s.located = 0
         mixture.fix(s, t_ns, e, n, sd)
