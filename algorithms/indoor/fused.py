@@ -81,12 +81,12 @@ class IndoorFusedParams(msgspec.Struct, frozen=True, kw_only=True):
         float,
         meta(
             "how much stronger or weaker the receiver (or tag) is on one side, standard deviation along each axis of "
-            "the plan; its turning is followed",
+            "the plan; its turning is followed (0: alike all round)",
             "dB",
             "",
             ge=0,
         ),
-    ] = 2.0
+    ] = 0.0
     pattern_s: Annotated[float, meta("time over which it looks the same way", "s", "", gt=0)] = 3.0
     freedom: Annotated[float, meta("degrees of freedom of Student's t", "", "Lange et al. 1989", gt=0)] = 4.0
     range_sd_m: Annotated[float, meta("of ranges that are measured as such", "m", "", gt=0)] = 0.3
@@ -144,6 +144,7 @@ class IndoorFused(KernelEstimator):
     Params: ClassVar[type[msgspec.Struct]] = IndoorFusedParams
     presets: ClassVar = {
         "no-map": {"use_map": False},
+        "turning": {"pattern_db": 2.0},
         # Steps between walls alone: nothing but particles keeps the ways round a corner apart.
         "walls": {"particles": 4000, "known_start": True, "start_sd_m": 0.3},
     }
