@@ -101,7 +101,7 @@ class Signals(ByTransmitter):
         away = trace.at(t_ns)[:, :2] - anchor.position[:2]
         up = anchor.position[2] - HELD_M if anchor.position[2] > 0 else 0.0
         expected = anchor.p_d0 - 5.0 * anchor.eta * np.log10(np.maximum((away**2).sum(axis=1) + up**2, 0.09))
-        path = f"{self._at(mac)}/model"
+        path = f"{self._entity(mac)}/model"
         canvas.lines(path, [f"{printable(mac)} model"], [style.run_color(number)], 1.0)
         canvas.scalars(path, t_ns, expected)
 
