@@ -314,6 +314,18 @@ def test_figures_of_a_floor_show_what_the_recording_says(tmp_path):
     for kind in ("geometry", "radiomap", "ranges", "powers", "threshold", "triples", "points", "particles"):
         drawn = viz.figure(rec, kind=kind)
         assert any(ax.has_data() for ax in drawn.axes), kind
+    from .test_viz_rrd import column, statics
+
+    viz.write_rrd(rec, tmp_path / "v.rrd")  # powers with the model's line, particles and triples in the plan
+    mac = rec.table("/phone/radio")["mac"][0].replace(":", "\\:")
+    _, line = column(tmp_path / "v.rrd", f"/phone/radio/{mac}/model", "Scalars:scalars")
+    assert np.isfinite(line).all()
+    for output, run in (("particles", "indoor_fused"), ("triples", "indoor_trilateration")):
+        times, _ = column(tmp_path / "v.rrd", f"/run/{run}_phone_radio/{output}", "Points3D:positions")
+        assert len(times) == rec.table(f"/estimate/{run}_phone_radio/{output}")["t_ns"].n_unique()
+    # on a plan a track stays where it is: no transform but the identity
+    moved = statics(tmp_path / "v.rrd", "/run/indoor_fused_phone_radio", "Transform3D:translation")
+    np.testing.assert_array_equal(np.ravel(moved), 0.0)
     found = geometry_of(rec)
     known = np.isfinite(found.bound_m)
     assert (found.extra_bound_m[known] <= found.bound_m[known] + 1e-9).all()  # another anchor never harms
