@@ -305,9 +305,11 @@ def joints(view: RunView) -> dict[str, float]:
     share inside the stated 95 %.
     """
     base = view.whole or view
-    sigma = base.table("sigma")
     metrics: dict[str, float] = {}
-    for name, own, truth, sign in _pairs(base):
+    if not (pairs := list(_pairs(base))):
+        return metrics  # a long walk's table is not read for nothing
+    sigma = base.table("sigma")
+    for name, own, truth, sign in pairs:
         events = events_of(base.annotations, name)
         starts = events if len(events) >= LEAST_EVENTS else None
         values = figures(own[0], own[1], truth[0], sign * truth[1], starts, view.spans, _stated(sigma, name))

@@ -192,8 +192,8 @@ def waypoint_ellipse(view: RunView) -> dict[str, float]:
     compared = view.compared("origin")
     if compared is None or compared.on_estimate or len(compared.t_ns) < 2:
         return {}
-    sigma, cov = view.table("sigma"), _local_covariances(view)
-    if sigma is None or not len(cov):
+    cov = _local_covariances(view)
+    if not len(cov) or (sigma := view.table("sigma")) is None:
         return {}
     newest = np.searchsorted(sigma["t_ns"].to_numpy(), compared.t_ns, "right") - 1
     later = newest[1:] >= 0  # the first one has no error by definition
@@ -204,10 +204,11 @@ def waypoint_ellipse(view: RunView) -> dict[str, float]:
 
 def _local_covariances(view: RunView) -> FloatArray:
     """Return the covariances that a local track of a phone states; none of other estimators'."""
-    sigma = view.table("sigma")
+    if not view.has("state"):
+        return np.empty((0, 2, 2))  # before the large table of standard deviations is read
+    sigma, state = view.table("sigma"), view.table("state")
     if sigma is None or not {"sigma_pos_x", "sigma_pos_y"} <= set(sigma.columns):
         return np.empty((0, 2, 2))
-    state = view.table("state")
     if state is None or "correlation_en" not in state.columns:
         return np.empty((0, 2, 2))
     return stated_covariances(sigma, state, ("sigma_pos_x", "sigma_pos_y"))

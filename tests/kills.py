@@ -100,11 +100,16 @@ COMMANDS = (
     Command("simulate", ("simulate", "rectangle", "-o", "out"), "out"),
     Command("demo", ("demo", "-o", "out"), "out"),
     Command("align", ("align", "leg.mcap", "-o", "out.mcap"), "out.mcap", sound),
-    Command("calibrate", ("calibrate", "imu", "in.mcap", "-o", "out.json"), "out.json", any_file),
+    Command(
+        "calibrate",
+        ("calibrate", "imu", "in.mcap", "--input", "/foot/imu1", "-o", "out.json"),
+        "out.json",
+        any_file,
+    ),
     Command("evaluate", ("evaluate", "done.mcap")),
     Command("check", ("check", "in.mcap")),
     Command("info", ("info", "in.mcap")),
-    Command("tune", ("tune", "in.mcap", *WALK, "-p", "window_s=0.05:0.1:3")),
+    Command("tune", ("tune", "in.mcap", *WALK, "-p", "window_s=0.05:0.1:3", "--length-m", "22")),
 )
 PRINTING = {"formats", "estimators", "completion"}
 """Commands that print what is installed: they read no file of the user, and write none."""

@@ -290,3 +290,16 @@ def test_no_command_replaces_its_input(tmp_path: Path, command: tuple[str, ...],
     assert "is the input itself" in done.err.splitlines()[-1]
     assert path.read_bytes() == before
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "b.mcap", "hard.mcap", "link.mcap"]
+
+
+def test_a_table_that_lacks_an_axis_is_left_out_and_counted(tmp_path: Path) -> None:
+    from .test_import_phone_apps import TestSensorLogger
+
+    log = TestSensorLogger().sample(tmp_path)
+    table = log / "Gravity.csv"
+    lines = table.read_text().splitlines()
+    table.write_text("\n".join([lines[0].replace(",y,", ",why,"), *lines[1:]]) + "\n")
+    done = convert(log, tmp_path / "out.mcap", format="sensor-logger")
+    assert done.report.rows_read == done.report.rows_kept + done.report.rows_dropped
+    (finding,) = [f for f in done.report.findings if f.kind == "missing_column"]
+    assert finding.count == len(lines) - 1

@@ -50,6 +50,8 @@ READ = (
     "GyroscopeUncalibrated", "Magnetometer", "MagnetometerUncalibrated", "Location", "LocationGps", "Barometer",
     "Pedometer", "Orientation",
 )  # fmt: skip
+_TRIPLES = READ[:8]
+"""Tables of three axes."""
 _TEXT = ("sensor", "name", "text", "standardisation")
 _NUMBERS = {
     "time", "seconds_elapsed", "x", "y", "z", "latitude", "longitude", "altitude", "horizontalAccuracy",
@@ -255,6 +257,9 @@ def _streams(
 ) -> Iterator[tuple[Stream, pl.DataFrame]]:
     axes = ("x", "y", "z")
     sign = -1.0 if turned else 1.0
+    for name in [n for n in _TRIPLES if n in tables and not set(axes) <= set(tables[n].columns)]:
+        rows = tables.pop(name).height
+        report.drop("missing_column", f"{name}: not all of the columns x, y, z; left out", count=rows)
     acc = _acceleration(tables, turned, report)
     if acc is not None:
         how, frame = acc
