@@ -123,7 +123,8 @@ class RadioWatch:
 def addresses(attachments: Iterable[SourceAttachment]) -> list[str]:
     """Return the addresses of an import's ``anchors.csv``; none where there is none."""
     table = next((a.data for a in attachments if a.name == "anchors.csv"), b"")
-    return [row["mac"] for row in csv.DictReader(io.StringIO(table.decode()))] if table else []
+    rows = csv.DictReader(table.decode("utf-8", "replace").splitlines())  # a bare return ends a line as well
+    return [row["mac"] for row in rows if row.get("mac")]
 
 
 def _is_local(mac: pl.Expr) -> pl.Expr:

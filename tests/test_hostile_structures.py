@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,8 @@ from marcha.export import export
 from marcha.export.labels import read_labels
 from marcha.ingest import convert
 from marcha.ingest.anatomy import frame
+from marcha.ingest.contract import SourceAttachment
+from marcha.ingest.radio import addresses
 from marcha.ingest.workbook import MOST_CELLS, read_workbook
 from marcha.recording import MarchaError, UsageError
 from marcha.viz import domain_figures
@@ -303,3 +306,22 @@ def test_a_table_that_lacks_an_axis_is_left_out_and_counted(tmp_path: Path) -> N
     assert done.report.rows_read == done.report.rows_kept + done.report.rows_dropped
     (finding,) = [f for f in done.report.findings if f.kind == "missing_column"]
     assert finding.count == len(lines) - 1
+
+
+@pytest.mark.parametrize("number", ["9" * 400, "null", '"x"'])
+def test_a_receiver_at_no_place_is_one_line(tmp_path: Path, number: str) -> None:
+    from .test_import_ble_mbd import TestBleMbd
+
+    log = TestBleMbd().sample(tmp_path)
+    (table,) = tmp_path.rglob("*.dev")
+    said = table.read_text()
+    table.write_text(re.sub(r"\[\[\s*-?[\d.]+", f"[[{number}", said, count=1))
+    assert table.read_text() != said
+    with pytest.raises(MarchaError, match="not \\[\\[x, y, z\\]"):
+        convert(log, tmp_path / "out.mcap", format="ble-mbd")
+
+
+def test_an_anchor_table_with_returns_inside_is_read_by_lines() -> None:
+    table = b"name,mac,x_m,y_m\na,00:00:00:00:00:01,0,0\rb,00:00:00:00:00:02,1,1\n"
+    found = addresses([SourceAttachment("anchors.csv", table, "text/csv")])
+    assert found == ["00:00:00:00:00:01", "00:00:00:00:00:02"]

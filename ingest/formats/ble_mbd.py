@@ -251,7 +251,7 @@ def _devices(file: Path) -> dict[str, tuple[list[float], str]]:
     match = re.search(r"Dongles:\s*(\{.*?\})\s*(Beacons:|$)", read_text(file), re.DOTALL)
     try:
         table = json.loads(match[1]) if match else None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise MarchaError(f"{file}: Dongles is not JSON: {error}") from error
     if not table:
         raise MarchaError(f"{file}: no 'Dongles:{{address: [[x, y, z], colour, name]}}'")
@@ -259,6 +259,6 @@ def _devices(file: Path) -> dict[str, tuple[list[float], str]]:
     for mac, about in table.items():
         try:
             devices[address(mac)] = ([float(v) for v in about[0][:3]], str(about[2]))
-        except (TypeError, ValueError, IndexError, KeyError) as error:
+        except (TypeError, ValueError, IndexError, KeyError, OverflowError) as error:
             raise MarchaError(f"{file}: receiver {mac}: not [[x, y, z], colour, name]") from error
     return devices
