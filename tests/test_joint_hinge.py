@@ -200,10 +200,10 @@ def test_free_joint_without_position_says_that_heading_is_not_observable() -> No
         blocks(make("joint.relative", joint="ball"), tables)
 
 
-@pytest.mark.data
-@pytest.mark.parametrize(("upper", "axis", "limit"), [(2, "x", 1.2), (3, "y", 0.5), (4, "z", 1.5)])
-def test_chain_with_cameras(data_dir: Path, upper: int, axis: str, limit: float) -> None:
-    """Online, one parameter set, after 1.2 s, bias included, constant delay of 15 ms stated."""
+def camera_chain(
+    data_dir: Path, upper: int, axis: str
+) -> tuple[dict[str, dict[str, pl.DataFrame]], np.ndarray, np.ndarray]:
+    """Return sensors of two neighbours of ``chain_optical``, and times and angle of the cameras, 15 ms taken out."""
     folder = data_dir / "leg" / "chain_optical"
     imu = pl.read_csv(folder / "imu_rigid.csv", comment_prefix="#")
     cameras = pl.read_csv(folder / "omc.csv", comment_prefix="#")
@@ -217,7 +217,15 @@ def test_chain_with_cameras(data_dir: Path, upper: int, axis: str, limit: float)
     turned = (Rotation.from_quat(quats[1][seen]).inv() * Rotation.from_quat(quats[0][seen])).as_quat()
     reference = np.unwrap(2 * np.arctan2(turned[:, "xyz".index(axis)], turned[:, 3]))
     at = np.round(np.flatnonzero(seen) / 30 * 1e9).astype(np.int64) - 15_000_000
-    found = blocks(make("joint.hinge", axis=axis), tables)
+    return tables, at, reference
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("upper", "axis", "limit"), [(2, "x", 1.2), (3, "y", 0.5), (4, "z", 1.5)])
+def test_chain_with_cameras(data_dir: Path, upper: int, axis: str, limit: float) -> None:
+    """Online, one parameter set, after 1.2 s, bias included, constant delay of 15 ms stated."""
+    tables, at, reference = camera_chain(data_dir, upper, axis)
+    found = blocks(make("joint.hinge", axis=axis, sd_mount_deg=0.0), tables)
     t_ns, knee, sigma = (
         found[o][c].to_numpy() for o, c in (("joint", "t_ns"), ("joint", "knee"), ("sigma", "knee"))
     )

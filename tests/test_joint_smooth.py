@@ -9,11 +9,19 @@ import numpy as np
 import polars as pl
 import pytest
 from marcha.algorithms import make
-from marcha.algorithms.joint.smooth import smooth
+from marcha.algorithms.joint import chain_smooth
+from marcha.algorithms.joint.common import IMU_COLUMNS
+from marcha.algorithms.joint.smooth import JointSmooth
 from marcha.ingest import convert
 from marcha.ingest.simulate import simulate
 from marcha.replay import Run, replay
+from marcha.replay import metrics_joint as mj
 from marcha.study.config import load
+from scipy.spatial.transform import Rotation
+
+from .event_loop import context_of
+from .test_joint_hinge import blocks, camera_chain, simulated
+from .test_joint_source import table
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +33,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[tuple[dict[str, Run],
         options = {"duration_s": 40, "segments": ("thigh", "shank"), "mount_deg": 0.0, "cycle_s": cycle}
         convert(simulate("walking", folder, seed=seed, **options).paths, folder / "leg.mcap")
         rec = mr.open(folder / "leg.mcap")
-        result = replay(rec, ["joint.hinge", "joint.smooth"])
+        result = replay(rec, ["joint.hinge", "joint.smooth"], params={"sd_mount_deg": 0.0})
         found.append(({r.estimator: r for r in result.runs}, rec.table("/reference/joint")))
     return found
 
@@ -43,8 +51,8 @@ def test_knowing_the_future_makes_it_better(runs: list[tuple[dict[str, Run], pl.
     assert make("joint.smooth").offline
     for pair, _ in runs:
         causal, smoothed = (pair[n].metrics for n in ("joint.hinge", "joint.smooth"))
-        assert smoothed["rmse_unbiased_deg.knee"] < 0.5 * causal["rmse_unbiased_deg.knee"]
-        assert smoothed["rmse_deg.knee"] < 0.9
+        assert smoothed["rmse_unbiased_deg.knee"] < 0.7 * causal["rmse_unbiased_deg.knee"]
+        assert smoothed["rmse_deg.knee"] < 1.2  # the accelerometers' constant error is in it
 
 
 @pytest.mark.parametrize("name", ["joint.hinge", "joint.smooth"])
@@ -71,33 +79,105 @@ def test_two_that_move_as_one_are_refused(tmp_path: Path) -> None:
     assert run.tables["joint"].is_empty()
 
 
-def test_smoother_is_the_least_squares_solution() -> None:
-    """Against the normal equations of the same model: states Δ and bias, white measurements and growth."""
-    rng = np.random.default_rng(1)
-    n, q, r, t = 40, (1e-4, 1e-5), 0.01, 0.1
-    z = np.cumsum(rng.normal(0, 0.05, n)) + rng.normal(0, 0.1, n)
-    out, work = np.empty((n, 2)), np.zeros((n, 8))
-    smooth(np.full(n, t), z, np.full(n, r), np.array(q), work, out)
-    rows: list[tuple[np.ndarray, float]] = []
+def test_backward_pass_is_that_of_rauch_tung_and_striebel() -> None:
+    """Against the textbook's equations with matrices, on the filter's own log of a simulated walk."""
+    _, tables, t = simulated(seed=2, duration_s=6.0)
+    estimator = JointSmooth()
+    estimator.start(context_of(estimator, tables))
+    parts = [next(iter(tables[s].values())).select(IMU_COLUMNS).to_numpy() for s in ("thigh", "shank")]
+    which = np.tile([0, 1], len(t))
+    values = np.stack(parts, axis=1).reshape(-1, 6)
+    logs = np.zeros(len(t) + 1, chain_smooth.LOG)
+    _, count = chain_smooth.forward(estimator.state, which, np.repeat(t, 2), values, logs, 0)
+    assert count == len(t)
+    logs = logs[:count]
+    out, work = np.zeros((count, 2)), np.zeros(1, chain_smooth.WORK)
+    chain_smooth.backward(estimator.state, logs, count, np.zeros(1, chain_smooth.LOG), work, out)
 
-    def add(entries: dict[int, float], value: float, variance: float) -> None:
-        row = np.zeros(2 * n)
-        for at, v in entries.items():
-            row[at] = v
-        rows.append((row / np.sqrt(variance), value / np.sqrt(variance)))
+    def flexion(rot: np.ndarray) -> float:
+        m = rot[0].T @ rot[1]
+        return float(np.arctan2(m[1, 2], m[2, 2]))
 
-    add({0: 1.0}, z[0], r)
-    add({1: 1.0}, 0.0, 1e-4)
-    for k in range(n):
-        add({2 * k: 1.0}, z[k], r)
-        if k:
-            add({2 * k: 1.0, 2 * k - 2: -1.0, 2 * k - 1: -t}, 0.0, q[0] * t)
-            add({2 * k + 1: 1.0, 2 * k - 1: -1.0}, 0.0, q[1] * t)
-    design, values = np.array([a for a, _ in rows]), np.array([b for _, b in rows])
-    expected = np.linalg.lstsq(design, values, rcond=None)[0]
-    np.testing.assert_allclose(out[:, 0], expected[::2], atol=1e-9)
-    variance = np.diag(np.linalg.inv(design.T @ design))[::2]
-    np.testing.assert_allclose(out[:, 1], variance, rtol=1e-6)
+    rot, bias, cov = logs["rot"][-1], logs["bias"][-1], logs["P"][-1]
+    expected = [(flexion(rot), rot, cov)]
+    for k in range(count - 2, -1, -1):
+        now, after = logs[k], logs[k + 1]
+        F = np.eye(12)
+        for i in range(2):
+            F[6 * i : 6 * i + 3, 6 * i + 3 : 6 * i + 6] = -after["dt"] * after["rot_before"][i]
+        C = now["P"] @ F.T @ np.linalg.inv(after["P_before"])
+        late = np.concatenate(
+            [
+                np.r_[
+                    Rotation.from_matrix(rot[i] @ after["rot_before"][i].T).as_rotvec(),
+                    bias[i] - after["bias_before"][i],
+                ]
+                for i in range(2)
+            ]
+        )
+        d = C @ late
+        rot = np.stack(
+            [Rotation.from_rotvec(d[6 * i : 6 * i + 3]).as_matrix() @ now["rot"][i] for i in range(2)]
+        )
+        bias = now["bias"] + np.stack([d[3:6], d[9:12]])
+        cov = now["P"] + C @ (cov - after["P_before"]) @ C.T
+        expected.append((flexion(rot), rot, cov))
+    expected.reverse()
+    np.testing.assert_allclose(out[:, 0], [e[0] for e in expected], atol=1e-7)
+    for k in (0, count // 2, count - 1):
+        about = expected[k][1][0][:, 0]
+        P = expected[k][2]
+        both = P[:3, :3] + P[6:9, 6:9] - P[:3, 6:9] - P[6:9, :3]
+        assert out[k, 1] == pytest.approx(np.sqrt(about @ both @ about), rel=1e-6)
+
+
+def test_segments_of_the_backward_pass_leave_no_seam(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, tables, _ = simulated(seed=2, duration_s=10.0)
+    whole, split = (smoothed(tables, monkeypatch, segment) for segment in (100_000, 37))
+    np.testing.assert_allclose(split, whole, rtol=1e-9, atol=1e-12)
+
+
+def smoothed(tables: dict[str, dict[str, pl.DataFrame]], patch: pytest.MonkeyPatch, size: int) -> np.ndarray:
+    patch.setattr("marcha.algorithms.joint.smooth.SEGMENT", size)
+    found = blocks(make("joint.smooth"), tables)
+    return np.stack([found["joint"]["knee"].to_numpy(), found["sigma"]["knee"].to_numpy()], axis=1)
+
+
+def test_wobble_of_the_joint_does_not_turn_the_angle_away() -> None:
+    """A knee is no pure hinge: 3° of turn about the other axes, while the leg swings, cost less than a degree.
+
+    Integrating the rates about fixed axes costs more: what the smoother did before.
+    """
+    capture, tables, t = simulated(seed=4, duration_s=40.0, mount_deg=0.0)
+    lower = tables["shank"]["/leg/shank/imu"]
+    at = t * 1e-9
+    wobble = Rotation.from_euler(
+        "yz", np.radians(3.0) * np.stack([np.sin(2 * np.pi * 0.9 * at), np.cos(2 * np.pi * 0.9 * at)], axis=1)
+    )
+    own = (wobble[:-1].inv() * wobble[1:]).as_rotvec() / np.diff(at)[:, None]
+    rate = wobble.inv().apply(lower.select(IMU_COLUMNS[3:]).to_numpy()) + np.vstack([own, own[-1:]])
+    force = wobble.inv().apply(lower.select(IMU_COLUMNS[:3]).to_numpy())
+    tables["shank"] = {"/leg/shank/imu": table(force, rate, t)}
+    found = blocks(make("joint.smooth"), tables)
+    error = np.degrees(found["joint"]["knee"].to_numpy() - capture.joints["knee"].angle)
+    sd = np.degrees(found["sigma"]["knee"].to_numpy())
+    late = at > 1.2
+    assert np.std(error[late]) < 1.0
+    assert np.mean(np.abs(error[late]) < 1.96 * sd[late]) > 0.9
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(("upper", "axis", "limit"), [(2, "x", 0.5), (3, "y", 0.3), (4, "z", 0.3)])
+def test_chain_with_cameras(data_dir: Path, upper: int, axis: str, limit: float) -> None:
+    """Without bias better than online, and inside its stated 95 %; joint 2-3 wobbles by 3° about its hinge."""
+    tables, at, reference = camera_chain(data_dir, upper, axis)
+    found = blocks(make("joint.smooth", axis=axis, sd_mount_deg=0.0), tables)
+    t_ns, knee, sigma = (
+        found[o][c].to_numpy() for o, c in (("joint", "t_ns"), ("joint", "knee"), ("sigma", "knee"))
+    )
+    figures = mj.figures(t_ns, knee, at, reference, stated=(t_ns, sigma))
+    assert figures["rmse_unbiased_deg"] < limit
+    assert figures["within95_percent"] > 90.0
 
 
 def test_study_of_the_source_states_its_tables() -> None:

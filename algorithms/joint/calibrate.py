@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -14,7 +14,17 @@ from ..calibration import Calibration, Calibrator, Stretch
 from ..contract import AlgorithmError, FloatArray, Input
 from ..parameters import meta
 from . import axisfit, vectorfit
-from .common import IMU_COLUMNS, imu, joint_name, mount_of, per_segment, vector
+from .common import (
+    IMU_COLUMNS,
+    given_mount,
+    imu,
+    joint_name,
+    long_axes,
+    mount_of,
+    per_segment,
+    sides_of,
+    vector,
+)
 from .merge import SEGMENTS
 
 MOST_ROWS = 20_000
@@ -69,8 +79,9 @@ class JointCalibrator(Calibrator):
 
     Values: ``hinges``, one per pair of neighbouring segments (``joint``, ``segments``, ``axes`` in both sensors'
     frames, ``axes_sd_deg``, ``positions_m`` from the joint's centre to each sensor, ``position_sd_m``, ``pairing``,
-    ``gyr_bias_rad_s``, ``acc_bias_m_s2``, ``usable``, ``why``), and ``rot_sb_<segment>``, the rotation from the
-    sensor's to the segment's frame (x flexion axis, z long axis upwards, y = z × x), row by row.
+    ``gyr_bias_rad_s``, ``acc_bias_m_s2``, ``long_axes_guessed``, ``usable``, ``why``), and
+    ``rot_sb_<segment>``, the rotation from the sensor's to the segment's frame (x flexion axis, z long axis
+    upwards, y = z × x), row by row.
     """
 
     name: ClassVar[str] = "joint"
@@ -111,12 +122,15 @@ class JointCalibrator(Calibrator):
                     axes[segment] = axis
             elif p.method == "static":
                 axes[segment] = vector(per_segment(p.axis, segment) or "x", "axis")
+        poses = [span for span, still in zip(spans, standing, strict=True) if still]
+        ups = self.long_axes(hinges, remarks, {s for s in axes if any(s in pose for pose in poses)})
         values: dict[str, Any] = {}
         if hinges:
             values["hinges"] = [{k: v for k, v in h.items() if k != "cov"} for h in hinges if h["usable"]]
-        poses = [span for span, still in zip(spans, standing, strict=True) if still]
         for segment, axis in axes.items():
-            up = self.upwards(segment, poses, remarks)
+            up = self.standing(segment, poses, remarks)
+            if up is None:
+                up = ups.get(segment, given_mount(p, segment)[2])
             values[f"rot_sb_{segment}"] = mount_of(axis, up).tolist()
         return Calibration(
             kind="joint",
@@ -176,8 +190,7 @@ class JointCalibrator(Calibrator):
         stretches = unbroken([(s[upper], s[lower]) for s in spans if upper in s and lower in s])
         if p.band_hz > 0.0 and stretches:
             best = vectorfit.fit(stretches, best.axes, p.band_hz, p.sd_gyr, p.sd_acc)
-        if best.axes[0] @ hint[0] < 0.0:
-            best = best._replace(axes=-best.axes)
+        best = best._replace(axes=self.sign(upper, lower, best, w, rows) * best.axes)
         sd = np.degrees(best.axes_sd)
         still = [n for n, r in zip((upper, lower), w["rate_rms"], strict=True) if r <= 0.05]
         why = ""
@@ -208,6 +221,17 @@ class JointCalibrator(Calibrator):
             },
         }
 
+    def sign(self, upper: str, lower: str, best: vectorfit.Hinge, work: Any, rows: FloatArray) -> float:
+        """Return the common sign of both axes: the parameter's, or, where it lies far off, a knee bends forward."""
+        mountings = np.array([given_mount(self.params, s) for s in (upper, lower)])
+        along = float(best.axes[0] @ mountings[0, 0])
+        if abs(along) < axisfit.NEAR and joint_name(upper, lower) == "knee" and best.position_sd < 0.05:
+            up, _ = long_axes(best.axes, mountings, best.positions, sides_of(upper, lower))
+            work["axis"], work["pos"] = best.axes, best.positions
+            bent = axisfit.bend(work, rows, len(rows), up)
+            return -1.0 if bent < 0.0 else 1.0
+        return -1.0 if along < 0.0 else 1.0
+
     def functional(self, segment: str, spans: Sequence[dict[str, Any]]) -> tuple[FloatArray, float]:
         """Return the main direction of a segment's rate and its spread in degrees."""
         rate = np.vstack([s[segment][1][:, 3:] for s in spans if segment in s])
@@ -222,18 +246,43 @@ class JointCalibrator(Calibrator):
         count = max(1.0, sum(s[segment][0][-1] - s[segment][0][0] for s in spans if segment in s) * 2e-9)
         return axis, float(np.degrees(math.atan(math.sqrt(power[1] / power[2] / count))))
 
-    def upwards(self, segment: str, poses: Sequence[dict[str, Any]], remarks: list[str]) -> FloatArray | None:
-        """Return the long axis in the sensor's frame: gravity while standing, else by ``up``."""
+    def long_axes(
+        self, hinges: Sequence[dict[str, Any]], remarks: list[str], stood: Collection[str]
+    ) -> dict[str, FloatArray]:
+        """Return the long axes of both segments of every usable hinge, and remark what is guessed."""
+        found: dict[str, FloatArray] = {}
+        for hinge in hinges:
+            if not hinge["usable"]:
+                continue
+            pair = hinge["segments"]
+            mountings = np.array([given_mount(self.params, s) for s in pair])
+            axes, levers = np.array(hinge["axes"]), np.array(hinge["positions_m"])
+            up, guessed = long_axes(axes, mountings, levers, sides_of(*pair))
+            hinge["long_axes_guessed"] = [g and s not in stood for g, s in zip(guessed, pair, strict=True)]
+            for segment, one, guess in zip(pair, up, guessed, strict=True):
+                if segment not in found or hinge["joint"] == "knee":
+                    found[segment] = one
+                if guess and segment not in stood:
+                    remarks.append(
+                        f"{segment}: its axis lies more than 45° off axis={self.params.axis}: its long axis is "
+                        "guessed from the joint's position (± 20°): the zero of the angle is not known; stand in a "
+                        "static span, or use zero=start"
+                    )
+        return found
+
+    def standing(
+        self, segment: str, poses: Sequence[dict[str, Any]], remarks: list[str]
+    ) -> FloatArray | None:
+        """Return the long axis in the sensor's frame: gravity while standing; None without such a span."""
         force = [s[segment][1][:, :3] for s in poses if segment in s]
-        if force:
-            f = np.vstack(force)
-            mean = f.mean(axis=0)
-            spread = float(np.linalg.norm(f - mean, axis=1).std())
-            if spread > 0.5:
-                remarks.append(f"{segment}: the standing pose is not still ({spread:.1f} m/s²)")
-            return mean / np.linalg.norm(mean)
-        up = per_segment(self.params.up, segment)
-        return vector(up, "up") if up else None
+        if not force:
+            return None
+        f = np.vstack(force)
+        mean = f.mean(axis=0)
+        spread = float(np.linalg.norm(f - mean, axis=1).std())
+        if spread > 0.5:
+            remarks.append(f"{segment}: the standing pose is not still ({spread:.1f} m/s²)")
+        return mean / np.linalg.norm(mean)
 
 
 def _table(stretch: Stretch, segment: str) -> tuple[Any, FloatArray]:

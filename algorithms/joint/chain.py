@@ -27,9 +27,11 @@ import numpy as np
 from ..contract import FloatArray
 from ..numerics.compiled import compiled
 from . import merge, selfaligned
+from .common import GUESS_DEG
 from .selfaligned import near
 
 HINGE, TWO, FREE = 0, 1, 2
+GUESS = math.radians(GUESS_DEG)
 MOST = merge.MOST
 STATES = 6 * MOST
 JOINTS = MOST - 1
@@ -74,10 +76,20 @@ DTYPE = np.dtype(
         ("angle_sd", "f8", (JOINTS,)),
         ("zero", "i8"),  # of the flexion: 0 by the mountings, 1 at the start, 2 by the encoder
         ("zero_s", "f8"),
+        ("sd_mount", "f8"),
+        ("mount_var", "f8"),  # of the zero by the mountings
+        ("tilt_var", "f8"),  # of the accelerometers' constant error
         ("zero_sum", "f8", (JOINTS,)),
+        ("zero_var", "f8", (JOINTS,)),  # sum of the angle's variance meanwhile
         ("zero_count", "i8", (JOINTS,)),
         ("zero_time", "f8"),
         ("steps", "i8"),
+        # Before the measurements of the sample, for the smoother.
+        ("keep", "i8"),
+        ("broken", "i8"),
+        ("rot_before", "f8", (MOST, 3, 3)),
+        ("bias_before", "f8", (MOST, 3)),
+        ("P_before", "f8", (STATES, STATES)),
         ("misfit", "f8"),  # of the connection, running mean square over its variance
     ]
 )
@@ -393,7 +405,24 @@ def set_zero(s: Any) -> None:
         if math.isfinite(target):
             mean = s.zero_sum[j] / max(1, s.zero_count[j])
             s.zero_sum[j] += near(s.angle[j, 0] - target, mean)
+            s.zero_var[j] += s.angle_sd[j] ** 2
             s.zero_count[j] += 1
+
+
+@compiled
+def stated_sd(s: Any, j: int) -> float:
+    """Return the standard deviation of flexion ``j`` with what does not change with time: zero and accelerometers."""
+    zero = s.mount_var if s.zero == 0 or s.zero_count[j] == 0 else s.zero_var[j] / s.zero_count[j]
+    return math.sqrt(s.angle_sd[j] ** 2 + zero + s.tilt_var)
+
+
+@compiled
+def spread_of_zero(s: Any) -> None:
+    """Write the variance of a hinge's zero by the mountings; a guessed long axis is known less well."""
+    s.mount_var = 0.0
+    for i in range(2):
+        sd = max(s.sd_mount, GUESS) if s.guessed[i] == 1 else s.sd_mount
+        s.mount_var += sd * sd
 
 
 @compiled
@@ -416,6 +445,20 @@ def set_axes(s: Any) -> None:
             p, q = (m + 1) % 3, (m + 2) % 3
             s.mount[i, 1, m] = s.mount[i, 2, p] * s.mount[i, 0, q] - s.mount[i, 2, q] * s.mount[i, 0, p]
     s.placed[0] = 1 if s.learn == 2 and s.pos_sd < 0.05 else 0
+    spread_of_zero(s)
+
+
+@compiled
+def remember(s: Any) -> None:
+    """Keep attitudes, biases and P before the measurements."""
+    for i in range(s.n):
+        for k in range(3):
+            s.bias_before[i, k] = s.bias[i, k]
+            for m in range(3):
+                s.rot_before[i, k, m] = s.rot[i, k, m]
+    for a in range(6 * s.n):
+        for b in range(6 * s.n):
+            s.P_before[a, b] = s.P[a, b]
 
 
 @compiled
@@ -435,6 +478,8 @@ def step(s: Any) -> bool:
     for i in range(s.n):
         if s.valid[i] == 1 and s.gap[i] > 0.0:
             restart(s, i)
+    if s.keep == 1:
+        remember(s)
     gravity(s)
     for j in range(s.n - 1):
         if s.valid[j] == 1 and s.valid[j + 1] == 1:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..contract import ALL_COLUMNS, AlgorithmError, Context, FloatArray, Input, KernelEstimator, Remark
 from ..parameters import meta
-from . import merge
+from . import axisfit, merge
 from .merge import ENCODER, JOINTS, SEGMENTS
 
 if TYPE_CHECKING:
@@ -78,14 +78,14 @@ def vector(text: str, name: str) -> FloatArray:
     if word in ("x", "y", "z"):
         return sign * np.eye(3)["xyz".index(word)]
     try:
-        values = np.array([float(part) for part in plain.replace(",", " ").split()])
+        found = np.array([float(part) for part in plain.replace(",", " ").split()])
     except ValueError:
-        values = np.zeros(0)
-    if values.shape != (3,) or not np.isfinite(values).all() or np.linalg.norm(values) < 1e-6:
+        found = np.zeros(0)
+    if found.shape != (3,) or not np.isfinite(found).all() or np.linalg.norm(found) < 1e-6:
         raise AlgorithmError(
             f"{name} = {text!r} is no direction; must be x, -x, y, -y, z, -z or three numbers like 0.1,0.9,0"
         )
-    return values / np.linalg.norm(values)
+    return found / np.linalg.norm(found)
 
 
 def per_segment(text: str, segment: str) -> str:
@@ -97,6 +97,42 @@ def per_segment(text: str, segment: str) -> str:
     if unknown:
         raise AlgorithmError(f"axis: no segment {unknown[0]!r}; must be one of {', '.join(SEGMENTS)}")
     return parts.get(segment, "")
+
+
+GUESS_DEG = 20.0
+"""How well the direction to the joint's centre stands for a long axis: a sensor sits on flesh, not in the bone."""
+
+
+def long_axes(
+    axes: FloatArray, mountings: FloatArray, levers: FloatArray, below: Sequence[float]
+) -> tuple[FloatArray, list[bool]]:
+    """Return the long axes (2, 3), upwards, in the frames of both sensors of a joint, and which of them are guessed.
+
+    Parameters
+    ----------
+    axes : ndarray, shape (2, 3)
+        Flexion axes that were found.
+    mountings : ndarray, shape (2, 3, 3)
+        As the parameters say: rows x flexion axis, y, z long axis.
+    levers : ndarray, shape (2, 3)
+        From the joint's centre to the sensors (m); zero where unknown.
+    below : sequence of float
+        1 where the sensor sits above the joint's centre, −1 below it, 0 where that says nothing (foot).
+    """
+    up, guessed = mountings[:, 2].copy(), [False, False]
+    for i in range(2):
+        if abs(axes[i] @ mountings[i, 0]) >= axisfit.NEAR:
+            continue
+        guessed[i] = True
+        across = below[i] * (levers[i] - (levers[i] @ axes[i]) * axes[i])
+        up[i] = across if np.linalg.norm(across) > 0.05 else np.eye(3)[int(np.argmin(np.abs(axes[i])))]
+        up[i] /= np.linalg.norm(up[i])
+    return up, guessed
+
+
+def sides_of(upper: str, lower: str) -> tuple[float, float]:
+    """Return 1 for a segment whose sensor sits above the joint, −1 below it, 0 for a foot."""
+    return 1.0, 0.0 if lower == "foot" else -1.0
 
 
 def mount_of(axis: FloatArray, up: FloatArray | None) -> FloatArray:
@@ -116,17 +152,22 @@ def mount_of(axis: FloatArray, up: FloatArray | None) -> FloatArray:
 
 def mounts(params: Any, segments: Sequence[str], context: Context | None) -> FloatArray:
     """Return sensor-to-segment rotations (n, 3, 3): by the joint calibration, else by the parameters."""
-    result = np.zeros((len(segments), 3, 3))
+    found = np.zeros((len(segments), 3, 3))
     calibration = context.calibrations.get("joint") if context is not None else None
     for i, segment in enumerate(segments):
         key = f"rot_sb_{segment}"
         if calibration is not None and calibration.usable and key in calibration.values:
-            result[i] = calibration.array(key)
-            continue
-        axis = vector(per_segment(params.axis, segment) or "x", "axis")
-        up = per_segment(params.up, segment)
-        result[i] = mount_of(axis, vector(up, "up") if up else None)
-    return result
+            found[i] = calibration.array(key)
+        else:
+            found[i] = given_mount(params, segment)
+    return found
+
+
+def given_mount(params: Any, segment: str) -> FloatArray:
+    """Return the sensor-to-segment rotation (3, 3) that the parameters ``axis`` and ``up`` say."""
+    axis = vector(per_segment(params.axis, segment) or "x", "axis")
+    up = per_segment(params.up, segment)
+    return mount_of(axis, vector(up, "up") if up else None)
 
 
 def joint_name(upper: str, lower: str) -> str:
@@ -164,12 +205,12 @@ class JointEstimator(KernelEstimator):
         """Take the segments that are attached, their mountings and calibrations."""
         super().start(context)
         self.context = context
-        roles = [i.name for i in self.inputs if i.name != "encoder"]
-        self.segments = tuple(n for n in roles if context.has(n)) or tuple(roles)
+        known = [i.name for i in self.inputs if i.name != "encoder"]
+        self.segments = tuple(n for n in known if context.has(n)) or tuple(known)
         if len(self.segments) < self.least:
             raise AlgorithmError(
                 f"{self.name}: {len(self.segments)} segment attached ({', '.join(self.segments)}), needs at least "
-                f"{self.least} of {', '.join(roles)}; attach one with --input NAME=TOPIC"
+                f"{self.least} of {', '.join(known)}; attach one with --input NAME=TOPIC"
             )
         self.encoder_columns = context.channels["encoder"][0].columns if context.has("encoder") else ()
         self.state = np.zeros(1, self.dtype)
@@ -232,11 +273,11 @@ class JointEstimator(KernelEstimator):
         """Say which sensors were missing."""
         s = self.state[0]
         total = int(s["samples"])
-        remarks: list[Remark] = []
+        found: list[Remark] = []
         if total == 0:
-            return remarks
+            return found
         if int(s["given"]) == 0 or ("on_line" in (self.dtype.names or ()) and s["on_line"] == 0):
-            remarks.append(
+            found.append(
                 Remark(
                     "no_overlap",
                     f"{', '.join(self.segments)} have no time in common; align their clocks or choose other channels",
@@ -247,11 +288,11 @@ class JointEstimator(KernelEstimator):
         for i, name in streams.items():
             missed = int(s["missed"][i])
             if s["on"][i] and missed > max(2, total // 1000):
-                remarks.append(
+                found.append(
                     Remark(
                         "sensor_missing",
                         f"{name} had no value at {missed} of {total} samples of {self.segments[0]}; "
                         "its angles are left out there",
                     )
                 )
-        return remarks
+        return found

@@ -46,6 +46,25 @@ class ChainParams(MergeParams, frozen=True, forbid_unknown_fields=True, kw_only=
     ] = 2.0
     tau_sway: Annotated[float, meta("Correlation time of the sway", "s", "ours", gt=0.0)] = 0.2
     sd_rest: Annotated[float, meta("Rate at rest against the bias", "rad/s", "ours", gt=0.0)] = 0.003
+    sd_mount_deg: Annotated[
+        float,
+        meta(
+            "How well the long axis of a segment is known in its sensor, about the flexion axis: a constant error of "
+            "both sensors in the stated standard deviation where zero = mounting. 0: known (a robot)",
+            "deg",
+            "ours",
+            ge=0.0,
+        ),
+    ] = 3.0
+    sd_acc_bias: Annotated[
+        float,
+        meta(
+            "Constant error of an accelerometer: tilts the angle, and no filter averages it out",
+            "m/s²",
+            "ours",
+            ge=0.0,
+        ),
+    ] = 0.05
     zero: Annotated[
         Literal["mounting", "start", "encoder"],
         meta(
@@ -116,6 +135,9 @@ class ChainEstimator(JointEstimator):
         s["mount"][:n] = mounts(p, self.segments, context)
         s["q_gyr"], s["q_bias"], s["p_bias"] = p.sd_gyr**2, p.walk_bias**2, p.sd_bias**2
         s["k_gyr"] = p.grow_gyr**2
+        s["sd_mount"] = np.radians(p.sd_mount_deg)
+        s["mount_var"] = 2.0 * s["sd_mount"] ** 2
+        s["tilt_var"] = 2.0 * (p.sd_acc_bias / p.gravity) ** 2
         s["zero"], s["zero_s"] = ("mounting", "start", "encoder").index(p.zero), p.zero_s
         if p.zero == "encoder" and not context.has("encoder") and context.channels:
             raise AlgorithmError(
@@ -187,6 +209,7 @@ class JointHinge(ChainEstimator):
         s["j"][0] = s["axis"]
         s["lever"][0] = s["pos"]
         s["placed"][0] = bool(np.any(s["pos"]))
+        chain.spread_of_zero(s)
 
     def remarks(self) -> list[Remark]:
         """Say whether the axes are known."""

@@ -33,6 +33,11 @@ FIELDS: list[Any] = [
     ("sd_acc", "f8"),
     ("gravity", "f8"),
     ("given_axis", "f8", (2, 3)),
+    ("given_up", "f8", (2, 3)),
+    ("below", "f8", (2,)),  # 1 where the sensor sits above the joint, −1 below, 0 where that says nothing
+    ("is_knee", "i8"),
+    ("guessed", "i8", (2,)),  # whether the long axis is guessed from the joint's position
+    ("bent", "f8"),  # to which side the joint bends (rad)
     # The angle.
     ("alpha_acc", "f8"),
     ("alpha_gyr", "f8"),
@@ -97,12 +102,52 @@ def identify(s: Any, lag: int) -> None:
     s.fits += 1
     if paired and observable(s):
         s.known = 1
+        orient(s)
     else:
         s.known = 0
         for i in range(2):
             for m in range(3):
                 s.axis[i, m] = s.given_axis[i, m]
+                s.up[i, m] = s.given_up[i, m]
                 s.pos[i, m] = 0.0
+            s.guessed[i] = 0
+
+
+@compiled
+def orient(s: Any) -> None:
+    """Set the long axes ``s.up``, and the sign of axes that lie far off the given one (:func:`.common.long_axes`).
+
+    Such a long axis is the direction to the joint's centre; a knee then bends forward.
+    """
+    for i in range(2):
+        cosine, along = 0.0, 0.0
+        for m in range(3):
+            s.up[i, m] = s.given_up[i, m]
+            cosine += s.axis[i, m] * s.given_axis[i, m]
+            along += s.axis[i, m] * s.pos[i, m]
+        s.guessed[i] = 1 if abs(cosine) < axisfit.NEAR else 0
+        if s.guessed[i] == 0:
+            continue
+        size = 0.0
+        for m in range(3):
+            s.up[i, m] = s.below[i] * (s.pos[i, m] - along * s.axis[i, m])
+            size += s.up[i, m] ** 2
+        if size < 0.0025:
+            least = 0
+            for m in range(3):
+                if abs(s.axis[i, m]) < abs(s.axis[i, least]):
+                    least = m
+            for m in range(3):
+                s.up[i, m] = 1.0 if m == least else 0.0
+        else:
+            for m in range(3):
+                s.up[i, m] /= math.sqrt(size)
+    s.bent = axisfit.bend(s, s.rows, s.kept, s.up)
+    if s.is_knee == 1 and s.guessed[0] == 1 and s.bent < 0.0:
+        s.bent = -s.bent
+        for i in range(2):
+            for m in range(3):
+                s.axis[i, m] = -s.axis[i, m]
 
 
 @compiled

@@ -2,229 +2,205 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
-import msgspec
 import numpy as np
+import polars as pl
 
 from ..calibration import Calibration, Stretch
-from ..contract import (
-    AlgorithmError,
-    Context,
-    FloatArray,
-    Input,
-    IntArray,
-    Message,
-    Output,
-    PlainEstimator,
-    Remark,
-    Result,
-)
-from ..numerics.compiled import compiled
+from ..contract import AlgorithmError, Context, FloatArray, IntArray, Output, Remark
 from ..parameters import meta
+from . import chain_smooth
 from .calibrate import JointCalibrationParams, JointCalibrator
-from .common import IMU_COLUMNS, imu, joint_name, mount_of, per_segment, side_of, vector
-from .source import JOINT_STATE, NAMED
+from .common import IMU_COLUMNS
+from .relative import ChainEstimator, HingeParams, JointHinge
+from .source import JOINT_STATE, NAMED, axis_remarks, mounting_remarks
 
-GAP_S = 0.1
-"""Longest pause that is interpolated; behind a longer one the smoother begins anew."""
-SEGMENTS = ("thigh", "shank")
-
-
-class SmoothParams(JointCalibrationParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Of the identification (as calibration ``joint``) and of the smoother's noise."""
-
-    noise_gyr: Annotated[float, meta("Noise of the angular rate", "rad/s/√Hz", "ours", gt=0.0)] = 0.002
-    walk_bias: Annotated[float, meta("Random walk of the bias", "rad/s/√s", "ours", gt=0.0)] = 1e-4
-    sd_angle: Annotated[
-        float,
-        meta("Misfit of the angle from the accelerometers, gravity across the axis", "rad", "ours", gt=0.0),
-    ] = 0.05
-    tau_angle: Annotated[float, meta("Correlation time of that misfit", "s", "ours", gt=0.0)] = 0.2
-    grow_angle: Annotated[
-        float, meta("Growth of sd_angle with |‖f‖ − g| of the joint's centre, in g", "rad", "ours", ge=0.0)
-    ] = 0.3
+SEGMENT = 2048
+"""Samples whose covariances are held at once; the forward pass is run again segment by segment, backwards."""
 
 
-@compiled
-def smooth(
-    dt: FloatArray, z: FloatArray, r: FloatArray, q: FloatArray, work: FloatArray, out: FloatArray
-) -> None:
-    """Write the smoothed Δ = α − ∫ω and its variance to ``out`` (n, 2): Rauch, Tung and Striebel (1965).
+class SmoothParams(HingeParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Of ``joint.hinge``; ``identify`` is over the whole recording, as calibration ``joint`` does it."""
 
-    States Δ and the rate's bias b, Δ' = b; measurements z of Δ with variances r; q: growth of both variances a
-    second. ``work`` (n, 8) holds the states, their covariances, and those before the measurement.
-    """
-    n = z.shape[0]
-    x, p, before = work[:, 0:2], work[:, 2:5], work[:, 5:8]
-    d, b, p00, p01, p11 = z[0], 0.0, r[0], 0.0, 1e-4
-    for k in range(n):
-        t = dt[k] if k > 0 else 0.0
-        d += t * b
-        p00, p01, p11 = p00 + t * (2.0 * p01 + t * p11) + q[0] * t, p01 + t * p11, p11 + q[1] * t
-        before[k, 0], before[k, 1], before[k, 2] = p00, p01, p11
-        total = p00 + r[k]
-        k0, k1, e = p00 / total, p01 / total, z[k] - d
-        d, b = d + k0 * e, b + k1 * e
-        p11 -= k1 * p01
-        p01 *= 1.0 - k0
-        p00 *= 1.0 - k0
-        x[k, 0], x[k, 1] = d, b
-        p[k, 0], p[k, 1], p[k, 2] = p00, p01, p11
-    out[n - 1, 0], out[n - 1, 1] = x[n - 1, 0], p[n - 1, 0]
-    d, b, s00, s01, s11 = x[n - 1, 0], x[n - 1, 1], p[n - 1, 0], p[n - 1, 1], p[n - 1, 2]
-    for k in range(n - 2, -1, -1):
-        t = dt[k + 1]
-        m00, m01, m11 = before[k + 1, 0], before[k + 1, 1], before[k + 1, 2]
-        det = m00 * m11 - m01 * m01
-        f00, f01 = p[k, 0] + t * p[k, 1], p[k, 1]
-        f10, f11 = p[k, 1] + t * p[k, 2], p[k, 2]
-        g00, g01 = (f00 * m11 - f01 * m01) / det, (f01 * m00 - f00 * m01) / det
-        g10, g11 = (f10 * m11 - f11 * m01) / det, (f11 * m00 - f10 * m01) / det
-        ed, eb = d - (x[k, 0] + t * x[k, 1]), b - x[k, 1]
-        d, b = x[k, 0] + g00 * ed + g01 * eb, x[k, 1] + g10 * ed + g11 * eb
-        c00, c01, c11 = s00 - m00, s01 - m01, s11 - m11
-        h00, h01 = g00 * c00 + g01 * c01, g00 * c01 + g01 * c11
-        h10, h11 = g10 * c00 + g11 * c01, g10 * c01 + g11 * c11
-        s00, s01 = p[k, 0] + h00 * g00 + h01 * g01, p[k, 1] + h00 * g10 + h01 * g11
-        s11 = p[k, 2] + h10 * g10 + h11 * g11
-        out[k, 0], out[k, 1] = d, s00
+    band_hz: Annotated[
+        float, meta("Identification: misfits are low-passed here", "Hz", "ours", ge=0.0, le=20.0)
+    ] = 1.5
+    max_sd_deg: Annotated[
+        float, meta("Largest standard deviation of an axis that is called observable", "deg", "ours", gt=0.0)
+    ] = 3.0
 
 
-class JointSmooth(PlainEstimator):
+class JointSmooth(ChainEstimator):
     """Angle of a hinge from two sensors, past and future together. Not causal, for records only.
 
-    Axes, position and gyroscope biases come from the whole recording as calibration ``joint`` finds them (or from such
-    a calibration); the angle is the integral of the rates about the axes, held by the angle of the joint's
-    acceleration as both sensors see it, smoothed forward and backward. Ours.
+    Axes and position come from the whole recording as calibration ``joint`` finds them, or from such a calibration.
+    With them the filter of ``joint.hinge`` runs forward and a Rauch-Tung-Striebel pass backward over its error
+    states: rotations of both segments, so that a joint that wobbles about its hinge does not turn the angle away,
+    as it does where rates about fixed axes are integrated. Ours.
     """
 
     name: ClassVar[str] = "joint.smooth"
     title: ClassVar[str] = "hinge angle of a whole recording, forward and backward"
-    source: ClassVar[str] = "ours; Rauch, Tung and Striebel 1965; Seel et al. 2014"
+    source: ClassVar[str] = "ours; Rauch, Tung and Striebel 1965; Weygers and Kok 2020"
     offline: ClassVar[bool] = True
     Params = SmoothParams
-    inputs: tuple[Input, ...] = (imu("thigh"), imu("shank"))
-    outputs: tuple[Output, ...] = (
-        Output("joint", JOINT_STATE, ("knee",)),
-        Output("sigma", NAMED, ("knee",), metadata=(("unit", "rad"),)),
-    )
+    inputs = JointHinge.inputs
 
-    def __init__(self, params: msgspec.Struct | None = None) -> None:
-        super().__init__(params)
-        self._kept: dict[str, list[tuple[int, Sequence[float]]]] = {s: [] for s in SEGMENTS}
-        self._given: Calibration | None = None
-        self._remarks: list[Remark] = []
+    def set_up_joints(self, context: Context) -> None:
+        """Write axes; nothing is found on the way."""
+        JointHinge.set_up_joints(self, context)  # pyright: ignore[reportArgumentType]
+        self.state[0]["learn"], self.state[0]["keep"] = 0, 1
+
+    def outputs_of(self) -> tuple[Output, ...]:
+        """Return the angle and its standard deviation."""
+        joints = self.joint_names()
+        return (
+            Output("joint", JOINT_STATE, joints),
+            Output("sigma", NAMED, joints, metadata=(("unit", "rad"),)),
+        )
 
     def start(self, context: Context) -> None:
         """Take the joint calibration, and the side of the leg."""
-        calibration = context.calibrations.get("joint")
-        if calibration is not None and not calibration.usable:
+        super().start(context)
+        found = context.calibrations.get("joint")
+        if found is not None and not found.usable:
             raise AlgorithmError("the joint calibration says not observable; calibrate on other motion")
-        self._given = calibration
-        joint = side_of(context, SEGMENTS) + joint_name(*SEGMENTS)
-        self.outputs = (
-            Output("joint", JOINT_STATE, (joint,)),
-            Output("sigma", NAMED, (joint,), metadata=(("unit", "rad"),)),
-        )
-        self._kept = {s: [] for s in SEGMENTS}
-        self._remarks = []
+        self._given = found if found is not None and found.values.get("hinges") else None
+        self._kept: list[tuple[IntArray, IntArray, FloatArray]] = []
+        self._found: list[Remark] = []
 
-    def take(self, message: Message) -> None:
-        """Keep the message."""
-        self._kept[message.input].append((message.t_ns, message.values))
+    def run(  # type: ignore[override]
+        self,
+        state: Any,
+        inputs: IntArray,
+        channels: IntArray,
+        t_ns: IntArray,
+        values: FloatArray,
+        *results: Any,
+    ) -> int:
+        """Keep the messages."""
+        del state, channels, results
+        if len(t_ns):
+            self._kept.append((inputs.copy(), t_ns.copy(), values.copy()))
+        return 0
 
-    def finish(self) -> list[Result]:
-        """Return the smoothed angle at the thigh's times."""
-        import polars as pl
+    def held(self) -> tuple[IntArray, FloatArray]:
+        """Return the smoothed angle and its standard deviation at the thigh's times."""
+        nothing = np.zeros(0, np.int64), np.zeros((0, self.width))
+        tables = self._tables()
+        few = [s for s in self.segments if s not in tables or tables[s].height < 5]
+        if few:
+            count = tables[few[0]].height if few[0] in tables else 0
+            self._found = [Remark("no_data", f"{few[0]}: {count} samples; nothing to smooth", fatal=True)]
+            return nothing
+        found = self._given
+        if found is None and self.params.identify != "off":
+            found = self._identified(tables)
+            if not found.usable:
+                self._found = [Remark("not_observable", "; ".join(found.remarks), fatal=True)]
+                return nothing
+            sd = found.values["hinges"][0]["axes_sd_deg"]
+            self._found = [
+                Remark("axis_found", f"hinge axes of the whole recording ± {sd[0]:.1f}° and {sd[1]:.1f}°")
+            ]
+        if found is not None:
+            self.state[:] = 0
+            self._lay(replace(self.context, calibrations={**self.context.calibrations, "joint": found}))
+        return self._smoothed()
 
-        tables = {}
-        for segment, rows in self._kept.items():
-            if len(rows) < 5:
-                self._remarks = [
-                    Remark("no_data", f"{segment}: {len(rows)} samples; nothing to smooth", fatal=True)
-                ]
-                return []
-            values = np.array([r[1] for r in rows], dtype=np.float64)
-            tables[segment] = pl.DataFrame(
-                {
-                    "t_ns": np.array([r[0] for r in rows], np.int64),
-                    **{c: values[:, k] for k, c in enumerate(IMU_COLUMNS)},
-                }
+    def _tables(self) -> Mapping[str, pl.DataFrame]:
+        if not self._kept:
+            return {}
+        which, t_ns, values = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
+        self._kept = [(which, t_ns, values)]
+        return {
+            need.name: pl.DataFrame(
+                {"t_ns": t_ns[mine], **{c: values[mine, k] for k, c in enumerate(IMU_COLUMNS)}}
             )
-        calibration = self._given
-        if calibration is None or not calibration.values.get("hinges"):
-            params = {f: getattr(self.params, f) for f in JointCalibrationParams.__struct_fields__}
-            calibrator = JointCalibrator(JointCalibrationParams(**{**params, "method": "hinge"}))
-            calibration = calibrator.calibrate([Stretch({}, {s: (t,) for s, t in tables.items()})])
-        if not calibration.usable:
-            self._remarks = [Remark("not_observable", "; ".join(calibration.remarks), fatal=True)]
-            return []
-        hinge = next(h for h in calibration.values["hinges"] if tuple(h["segments"]) == SEGMENTS)
-        sd = hinge["axes_sd_deg"]
-        self._remarks = [
-            Remark("axis_found", f"hinge axes of the whole recording ± {sd[0]:.1f}° and {sd[1]:.1f}°")
-        ]
-        return self._angles(tables["thigh"], tables["shank"], hinge)
+            for i, need in enumerate(self.inputs[:2])
+            if len(mine := np.flatnonzero(which == i))
+        }
 
-    def _angles(self, upper: Any, lower: Any, hinge: dict[str, Any]) -> list[Result]:
-        parts = [(t["t_ns"].to_numpy(), t.select(IMU_COLUMNS).to_numpy()) for t in (upper, lower)]
-        (t_ns, own), (s_ns, other) = (
-            (t[good], v[good])
-            for t, v in parts
-            for good in (np.isfinite(v).all(axis=1) & np.r_[True, np.diff(np.maximum.accumulate(t)) > 0],)
-        )
-        s = (s_ns - t_ns[0]) * 1e-9
-        t = (t_ns - t_ns[0]) * 1e-9
-        k = np.clip(np.searchsorted(s, t), 1, len(s) - 1)
-        covered = (t >= s[0]) & (t <= s[-1]) & (s[k] - s[k - 1] <= GAP_S)
-        both = np.hstack([own, np.stack([np.interp(t, s, v) for v in other.T], axis=1)])
-        results: list[Result] = []
-        broken = np.flatnonzero((np.diff(t) > GAP_S) | (covered[1:] != covered[:-1])) + 1
-        for part in np.split(np.arange(len(t)), broken):
-            if len(part) >= 10 and covered[part[0]]:
-                results += self._stretch(t_ns[part], t[part], both[part], hinge)
-        return results
-
-    def _stretch(
-        self, t_ns: IntArray, t: FloatArray, both: FloatArray, hinge: dict[str, Any]
-    ) -> list[Result]:
+    def _identified(self, tables: Mapping[str, pl.DataFrame]) -> Calibration:
         p = self.params
-        dt = np.diff(t, prepend=2 * t[0] - t[1])
-        turn, plane, norm = np.zeros(len(t)), [], []
-        for i, segment in enumerate(SEGMENTS):
-            axis, o = np.array(hinge["axes"][i]), np.array(hinge["positions_m"][i])
-            force, rate = both[:, 6 * i : 6 * i + 3], both[:, 6 * i + 3 : 6 * i + 6]
-            rate = rate - np.array(hinge.get("gyr_bias_rad_s", np.zeros((2, 3)))[i])
-            force = force - np.array(hinge.get("acc_bias_m_s2", np.zeros((2, 3)))[i])
-            slope = np.gradient(rate, t, axis=0)
-            centre = rate * (rate @ o)[:, None] - o * np.sum(rate**2, axis=1)[:, None] + np.cross(slope, o)
-            up = per_segment(p.up, segment)
-            mount = mount_of(axis, vector(up, "up") if up else None)
-            inside = (force - centre) @ mount.T
-            turn += (1.0 if i == 0 else -1.0) * (rate @ axis)
-            plane.append(inside)
-            norm.append(np.abs(np.linalg.norm(inside, axis=1) - p.gravity))
-        u, v = plane
-        z = np.arctan2(u[:, 1] * v[:, 2] - u[:, 2] * v[:, 1], u[:, 1] * v[:, 1] + u[:, 2] * v[:, 2])
-        rates = np.cumsum(0.5 * dt * (turn + np.r_[turn[0], turn[:-1]]))
-        late = np.unwrap(z - rates)
-        across = np.minimum(np.hypot(u[:, 1], u[:, 2]), np.hypot(v[:, 1], v[:, 2])) / p.gravity
-        sd = (p.sd_angle + p.grow_angle * 0.5 * (norm[0] + norm[1]) / p.gravity) / np.maximum(0.05, across)
-        out = np.empty((len(t), 2))
-        variance = sd**2 * 2.0 * p.tau_angle / np.maximum(1e-4, dt)
-        growth = np.array([p.noise_gyr**2, p.walk_bias**2])
-        smooth(dt, late, variance, growth, np.zeros((len(t), 8)), out)
-        angle = rates + out[:, 0]
-        angle -= 2 * np.pi * np.round(np.median(angle) / (2 * np.pi))
-        spread = np.sqrt(np.maximum(0.0, out[:, 1]))
-        return [
-            result
-            for time_ns, a, b in zip(t_ns.tolist(), angle.tolist(), spread.tolist(), strict=True)
-            for result in (Result("joint", time_ns, (a,)), Result("sigma", time_ns, (b,)))
-        ]
+        calibrator = JointCalibrator(
+            JointCalibrationParams(
+                axis=p.axis,
+                up=p.up,
+                sd_gyr=p.misfit_gyr,
+                sd_acc=p.misfit_acc,
+                gravity=p.gravity,
+                band_hz=p.band_hz,
+                max_sd_deg=p.max_sd_deg,
+            )
+        )
+        found = calibrator.calibrate([Stretch({}, {s: (t,) for s, t in tables.items()})])
+        if p.identify == "axes":
+            for hinge in found.values.get("hinges", ()):
+                hinge["positions_m"] = np.zeros((2, 3)).tolist()
+        return found
+
+    def _smoothed(self) -> tuple[IntArray, FloatArray]:
+        """Return times (n,), angles and standard deviations (n, 2)."""
+        which, t_ns, values = self._kept[0]
+        self._kept = []
+        logs = np.zeros(SEGMENT, chain_smooth.LOG)
+        starts: list[tuple[Any, int]] = []
+        times, encoder = [], []
+        message, count = 0, SEGMENT
+        while count == SEGMENT:
+            starts.append((self.state.copy(), message))
+            message, count = chain_smooth.forward(self.state, which, t_ns, values, logs, message)
+            times.append(logs["t_ns"][:count].copy())
+            encoder.append(logs["enc"][:count].copy())
+        found: list[FloatArray] = []
+        work, after = np.zeros(1, chain_smooth.WORK), np.zeros(1, chain_smooth.LOG)
+        end = self.state.copy()
+        for state, first in reversed(starts):
+            self.state[:] = state
+            _, count = chain_smooth.forward(self.state, which, t_ns, values, logs, first)
+            out = np.zeros((count, 2))
+            chain_smooth.backward(self.state, logs, count, after, work, out)
+            found.insert(0, out)
+        self.state[:] = end
+        at, angles = np.concatenate(times), np.concatenate(found)
+        if len(at):
+            self._settle(at, angles, np.concatenate(encoder))
+        return at, angles
+
+    def _settle(self, t_ns: IntArray, angles: FloatArray, encoder: FloatArray) -> None:
+        """Take out whole turns and the zero, in place; put the zero's uncertainty into the standard deviation."""
+        s, p = self.state[0], self.params
+        angles[:, 0] = np.unwrap(angles[:, 0])
+        spread = float(s["mount_var"])
+        off = 0.0
+        if s["zero"]:
+            early = t_ns <= t_ns[0] + round(p.zero_s * 1e9)
+            apart = angles[:, 0] - (encoder if p.zero == "encoder" else 0.0)
+            early &= np.isfinite(apart)
+            if early.any():
+                off, spread = float(np.mean(apart[early])), float(np.mean(angles[early, 1] ** 2))
+        else:
+            off = 2 * np.pi * float(np.round(np.median(angles[:, 0]) / (2 * np.pi)))
+        angles[:, 0] -= off
+        angles[:, 1] = np.sqrt(angles[:, 1] ** 2 + spread + s["tilt_var"])
+
+    def snapshot(self) -> Any:
+        """Return what was taken so far."""
+        return list(self._kept), self.state.copy()
+
+    def restore(self, snapshot: Any) -> None:
+        """Go back to what was taken at ``snapshot``."""
+        kept, self.state[:] = snapshot
+        self._kept = list(kept)
 
     def remarks(self) -> list[Remark]:
         """Say whether the axes are known."""
-        return self._remarks
+        if any(r.fatal for r in self._found):
+            return self._found
+        s = self.state[0]
+        found = self._found + (mounting_remarks(s, self.segments) if self._found else [])
+        return super().remarks() + (found or axis_remarks(s, self.segments, fatal=False))
