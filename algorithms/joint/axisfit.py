@@ -25,8 +25,8 @@ GYR, ACC, DGYR, SUM = 0, 3, 6, 9
 WIDTH = 12
 COLUMNS = 2 * WIDTH
 
-NEAR = 0.7
-"""Cosine (45°) between a found axis and the parameter's: beyond it the parameter says nothing of the sensor."""
+STILL = 0.03
+"""Turn (rad) of both segments below which a span says nothing of the signs: a long rest would drown the motion."""
 
 WORK: list[Any] = [
     ("axis", "f8", (2, 3)),
@@ -266,52 +266,6 @@ def angle_across(w: Any, row: FloatArray, sign: float) -> float:
 
 
 @compiled
-def set_long_axes(w: Any, up: FloatArray) -> None:
-    """Write x = j × c and y = j × x of eq 74 to ``w.tangent``, c the long axes ``up`` (2, 3): α is then flexion."""
-    for i in range(2):
-        jx, jy, jz = w.axis[i, 0], w.axis[i, 1], w.axis[i, 2]
-        x = jy * up[i, 2] - jz * up[i, 1]
-        y = jz * up[i, 0] - jx * up[i, 2]
-        z = jx * up[i, 1] - jy * up[i, 0]
-        size = max(1e-9, math.sqrt(x * x + y * y + z * z))
-        x, y, z = x / size, y / size, z / size
-        w.tangent[i, 0, 0], w.tangent[i, 0, 1], w.tangent[i, 0, 2] = x, y, z
-        w.tangent[i, 1, 0] = jy * z - jz * y
-        w.tangent[i, 1, 1] = jz * x - jx * z
-        w.tangent[i, 1, 2] = jx * y - jy * x
-
-
-@compiled
-def bend(w: Any, rows: FloatArray, count: int, up: FloatArray) -> float:
-    """Return to which side the joint bends from straight (eq 74, long axes ``up``), rad; NaN if unknown.
-
-    Mean plus half a standard deviation times the skewness: a knee bends one way only, and seldom far.
-    """
-    set_long_axes(w, up)
-    sine, cosine, used = 0.0, 0.0, 0
-    for k in range(count):
-        a = angle_across(w, rows[k], 1.0)
-        if math.isfinite(a):
-            sine += math.sin(a)
-            cosine += math.cos(a)
-            used += 1
-    if used < 20:
-        return math.nan
-    mean = math.atan2(sine, cosine)
-    square, cube = 0.0, 0.0
-    for k in range(count):
-        a = angle_across(w, rows[k], 1.0)
-        if math.isfinite(a):
-            a -= mean
-            a -= 2.0 * math.pi * math.floor(a / (2.0 * math.pi) + 0.5)
-            square += a * a
-            cube += a * a * a
-    square /= used
-    skew = cube / used / max(1e-12, square * math.sqrt(square))
-    return mean + 0.5 * math.sqrt(square) * max(-2.0, min(2.0, skew))
-
-
-@compiled
 def pairing_misfit(w: Any, rows: FloatArray, count: int, lag: int, sign: float) -> float:
     """Return the mean square misfit of eq 73 with eq 74 over ``lag`` samples, j_S times ``sign``; NaN if unknown."""
     set_tangent(w, 0)
@@ -321,11 +275,13 @@ def pairing_misfit(w: Any, rows: FloatArray, count: int, lag: int, sign: float) 
         a = angle_across(w, rows[k - lag], sign)
         b = angle_across(w, rows[k], sign)
         if math.isfinite(a) and math.isfinite(b):
-            turn = 0.0
+            upper, lower = 0.0, 0.0
             for m in range(3):
-                turn += (rows[k, SUM + m] - rows[k - lag, SUM + m]) * w.axis[0, m]
-                turn -= sign * (rows[k, WIDTH + SUM + m] - rows[k - lag, WIDTH + SUM + m]) * w.axis[1, m]
-            e = b - a - turn
+                upper += (rows[k, SUM + m] - rows[k - lag, SUM + m]) * w.axis[0, m]
+                lower += (rows[k, WIDTH + SUM + m] - rows[k - lag, WIDTH + SUM + m]) * w.axis[1, m]
+            if abs(upper) + abs(lower) < STILL:
+                continue
+            e = b - a - upper + sign * lower
             e -= 2.0 * math.pi * math.floor(e / (2.0 * math.pi) + 0.5)
             total += min(e * e, 0.25)
             used += 1

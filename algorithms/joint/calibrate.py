@@ -19,13 +19,12 @@ from .common import (
     given_mount,
     imu,
     joint_name,
-    long_axes,
     mount_of,
     per_segment,
-    sides_of,
     vector,
 )
 from .merge import SEGMENTS
+from .mounting import GUESS_DEG, NEAR, SKEWED, long_axes, skewness
 
 MOST_ROWS = 20_000
 
@@ -79,9 +78,9 @@ class JointCalibrator(Calibrator):
 
     Values: ``hinges``, one per pair of neighbouring segments (``joint``, ``segments``, ``axes`` in both sensors'
     frames, ``axes_sd_deg``, ``positions_m`` from the joint's centre to each sensor, ``position_sd_m``, ``pairing``,
-    ``gyr_bias_rad_s``, ``acc_bias_m_s2``, ``long_axes_guessed``, ``usable``, ``why``), and
-    ``rot_sb_<segment>``, the rotation from the sensor's to the segment's frame (x flexion axis, z long axis
-    upwards, y = z × x), row by row.
+    ``gyr_bias_rad_s``, ``acc_bias_m_s2``, ``mean_force_m_s2``, ``skewness``, ``long_axes_guessed``, ``usable``,
+    ``why``), and ``rot_sb_<segment>``, the rotation from the sensor's to the segment's frame (x flexion axis, z long
+    axis upwards, y = z × x), row by row.
     """
 
     name: ClassVar[str] = "joint"
@@ -190,7 +189,10 @@ class JointCalibrator(Calibrator):
         stretches = unbroken([(s[upper], s[lower]) for s in spans if upper in s and lower in s])
         if p.band_hz > 0.0 and stretches:
             best = vectorfit.fit(stretches, best.axes, p.band_hz, p.sd_gyr, p.sd_acc)
-        best = best._replace(axes=self.sign(upper, lower, best, w, rows) * best.axes)
+        w["axis"] = best.axes
+        skew = skewness(work[0], rows, len(rows), lag)
+        sign = self.sign(upper, joint, best.axes[0], skew)
+        best = best._replace(axes=sign * best.axes)
         sd = np.degrees(best.axes_sd)
         still = [n for n, r in zip((upper, lower), w["rate_rms"], strict=True) if r <= 0.05]
         why = ""
@@ -214,6 +216,11 @@ class JointCalibrator(Calibrator):
             "pairing": best.pairing,
             "gyr_bias_rad_s": best.biases.tolist(),
             "acc_bias_m_s2": best.acc_biases.tolist(),
+            "mean_force_m_s2": [
+                rows[:, axisfit.ACC + b : axisfit.ACC + b + 3].mean(axis=0).tolist()
+                for b in (0, axisfit.WIDTH)
+            ],
+            "skewness": sign * skew,
             "samples": len(rows),
             "cov": {
                 f"axis_{joint}_{segment}": best.axes_cov[i].tolist()
@@ -221,15 +228,11 @@ class JointCalibrator(Calibrator):
             },
         }
 
-    def sign(self, upper: str, lower: str, best: vectorfit.Hinge, work: Any, rows: FloatArray) -> float:
-        """Return the common sign of both axes: the parameter's, or, where it lies far off, a knee bends forward."""
-        mountings = np.array([given_mount(self.params, s) for s in (upper, lower)])
-        along = float(best.axes[0] @ mountings[0, 0])
-        if abs(along) < axisfit.NEAR and joint_name(upper, lower) == "knee" and best.position_sd < 0.05:
-            up, _ = long_axes(best.axes, mountings, best.positions, sides_of(upper, lower))
-            work["axis"], work["pos"] = best.axes, best.positions
-            bent = axisfit.bend(work, rows, len(rows), up)
-            return -1.0 if bent < 0.0 else 1.0
+    def sign(self, upper: str, joint: str, axis: FloatArray, skew: float) -> float:
+        """Return the common sign of both axes: the parameter's; where it lies far off, that of a knee's swings."""
+        along = float(axis @ given_mount(self.params, upper)[0])
+        if abs(along) < NEAR and joint == "knee" and abs(skew) > SKEWED:
+            return 1.0 if skew > 0.0 else -1.0
         return -1.0 if along < 0.0 else 1.0
 
     def functional(self, segment: str, spans: Sequence[dict[str, Any]]) -> tuple[FloatArray, float]:
@@ -256,17 +259,15 @@ class JointCalibrator(Calibrator):
                 continue
             pair = hinge["segments"]
             mountings = np.array([given_mount(self.params, s) for s in pair])
-            axes, levers = np.array(hinge["axes"]), np.array(hinge["positions_m"])
-            up, guessed = long_axes(axes, mountings, levers, sides_of(*pair))
+            up, guessed = long_axes(np.array(hinge["axes"]), mountings, np.array(hinge["mean_force_m_s2"]))
             hinge["long_axes_guessed"] = [g and s not in stood for g, s in zip(guessed, pair, strict=True)]
             for segment, one, guess in zip(pair, up, guessed, strict=True):
                 if segment not in found or hinge["joint"] == "knee":
                     found[segment] = one
                 if guess and segment not in stood:
                     remarks.append(
-                        f"{segment}: its axis lies more than 45° off axis={self.params.axis}: its long axis is "
-                        "guessed from the joint's position (± 20°): the zero of the angle is not known; stand in a "
-                        "static span, or use zero=start"
+                        f"{segment}: its axis lies more than 45° off axis={self.params.axis}: zero and sign of the "
+                        f"angle are guesses (long axis ± {GUESS_DEG:.0f}°); give axis and up, or stand in a static span"
                     )
         return found
 

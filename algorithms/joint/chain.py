@@ -27,7 +27,7 @@ import numpy as np
 from ..contract import FloatArray
 from ..numerics.compiled import compiled
 from . import merge, selfaligned
-from .common import GUESS_DEG
+from .mounting import GUESS_DEG
 from .selfaligned import near
 
 HINGE, TWO, FREE = 0, 1, 2

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..contract import ALL_COLUMNS, AlgorithmError, Context, FloatArray, Input, KernelEstimator, Remark
 from ..parameters import meta
-from . import axisfit, merge
+from . import merge
 from .merge import ENCODER, JOINTS, SEGMENTS
 
 if TYPE_CHECKING:
@@ -97,42 +97,6 @@ def per_segment(text: str, segment: str) -> str:
     if unknown:
         raise AlgorithmError(f"axis: no segment {unknown[0]!r}; must be one of {', '.join(SEGMENTS)}")
     return parts.get(segment, "")
-
-
-GUESS_DEG = 20.0
-"""How well the direction to the joint's centre stands for a long axis: a sensor sits on flesh, not in the bone."""
-
-
-def long_axes(
-    axes: FloatArray, mountings: FloatArray, levers: FloatArray, below: Sequence[float]
-) -> tuple[FloatArray, list[bool]]:
-    """Return the long axes (2, 3), upwards, in the frames of both sensors of a joint, and which of them are guessed.
-
-    Parameters
-    ----------
-    axes : ndarray, shape (2, 3)
-        Flexion axes that were found.
-    mountings : ndarray, shape (2, 3, 3)
-        As the parameters say: rows x flexion axis, y, z long axis.
-    levers : ndarray, shape (2, 3)
-        From the joint's centre to the sensors (m); zero where unknown.
-    below : sequence of float
-        1 where the sensor sits above the joint's centre, −1 below it, 0 where that says nothing (foot).
-    """
-    up, guessed = mountings[:, 2].copy(), [False, False]
-    for i in range(2):
-        if abs(axes[i] @ mountings[i, 0]) >= axisfit.NEAR:
-            continue
-        guessed[i] = True
-        across = below[i] * (levers[i] - (levers[i] @ axes[i]) * axes[i])
-        up[i] = across if np.linalg.norm(across) > 0.05 else np.eye(3)[int(np.argmin(np.abs(axes[i])))]
-        up[i] /= np.linalg.norm(up[i])
-    return up, guessed
-
-
-def sides_of(upper: str, lower: str) -> tuple[float, float]:
-    """Return 1 for a segment whose sensor sits above the joint, −1 below it, 0 for a foot."""
-    return 1.0, 0.0 if lower == "foot" else -1.0
 
 
 def mount_of(axis: FloatArray, up: FloatArray | None) -> FloatArray:

@@ -11,9 +11,11 @@ import math
 from typing import Any
 
 from ..numerics.compiled import compiled, inlined
-from . import axisfit
+from . import axisfit, mounting
 
 STORE = 1024
+STILL_RATE = 0.05
+"""Rate (rad/s) of both sensors below which a sample is not kept."""
 
 FIELDS: list[Any] = [
     *axisfit.WORK,
@@ -36,8 +38,8 @@ FIELDS: list[Any] = [
     ("given_up", "f8", (2, 3)),
     ("below", "f8", (2,)),  # 1 where the sensor sits above the joint, −1 below, 0 where that says nothing
     ("is_knee", "i8"),
-    ("guessed", "i8", (2,)),  # whether the long axis is guessed from the joint's position
-    ("bent", "f8"),  # to which side the joint bends (rad)
+    ("guessed", "i8", (2,)),  # whether the long axis is guessed from the mean force
+    ("skew", "f8"),  # of the joint's swings
     # The angle.
     ("alpha_acc", "f8"),
     ("alpha_gyr", "f8"),
@@ -102,7 +104,7 @@ def identify(s: Any, lag: int) -> None:
     s.fits += 1
     if paired and observable(s):
         s.known = 1
-        orient(s)
+        mounting.orient(s, lag)
     else:
         s.known = 0
         for i in range(2):
@@ -114,47 +116,19 @@ def identify(s: Any, lag: int) -> None:
 
 
 @compiled
-def orient(s: Any) -> None:
-    """Set the long axes ``s.up``, and the sign of axes that lie far off the given one (:func:`.common.long_axes`).
-
-    Such a long axis is the direction to the joint's centre; a knee then bends forward.
-    """
-    for i in range(2):
-        cosine, along = 0.0, 0.0
-        for m in range(3):
-            s.up[i, m] = s.given_up[i, m]
-            cosine += s.axis[i, m] * s.given_axis[i, m]
-            along += s.axis[i, m] * s.pos[i, m]
-        s.guessed[i] = 1 if abs(cosine) < axisfit.NEAR else 0
-        if s.guessed[i] == 0:
-            continue
-        size = 0.0
-        for m in range(3):
-            s.up[i, m] = s.below[i] * (s.pos[i, m] - along * s.axis[i, m])
-            size += s.up[i, m] ** 2
-        if size < 0.0025:
-            least = 0
-            for m in range(3):
-                if abs(s.axis[i, m]) < abs(s.axis[i, least]):
-                    least = m
-            for m in range(3):
-                s.up[i, m] = 1.0 if m == least else 0.0
-        else:
-            for m in range(3):
-                s.up[i, m] /= math.sqrt(size)
-    s.bent = axisfit.bend(s, s.rows, s.kept, s.up)
-    if s.is_knee == 1 and s.guessed[0] == 1 and s.bent < 0.0:
-        s.bent = -s.bent
-        for i in range(2):
-            for m in range(3):
-                s.axis[i, m] = -s.axis[i, m]
-
-
-@compiled
 def observable(s: Any) -> bool:
     """Return whether the identified axes may be used."""
     moved = s.turn_rms > 0.1 and s.rate_rms[0] > 0.05 and s.rate_rms[1] > 0.05
     return moved and s.axis_sd[0] < 0.05 and s.axis_sd[1] < 0.05 and s.pairing > 0.55
+
+
+@inlined
+def at_rest(s: Any) -> bool:
+    """Return whether neither sensor turns: a long rest would crowd the motion out of the store."""
+    size = 0.0
+    for i in range(2):
+        size = max(size, s.gyr[i, 0] ** 2 + s.gyr[i, 1] ** 2 + s.gyr[i, 2] ** 2)
+    return size < STILL_RATE * STILL_RATE
 
 
 @compiled
@@ -167,7 +141,7 @@ def watch(s: Any) -> bool:
         for m in range(3):
             s.whole[i, m] += s.turn[i, m]
     s.skip += 1
-    if s.slope[0] == 0 or s.slope[1] == 0 or s.skip < s.stride:
+    if s.slope[0] == 0 or s.slope[1] == 0 or s.skip < s.stride or at_rest(s):
         return False
     s.skip = 0
     k = s.kept
@@ -188,7 +162,7 @@ def watch(s: Any) -> bool:
     if s.elapsed < s.fit_at or s.kept < 60:
         return False
     s.fit_at = max(1.25 * s.elapsed, s.elapsed + 1.0)
-    lag = max(1, int(0.3 * s.kept / s.elapsed + 0.5))
+    lag = max(1, int(0.3 / (s.stride * max(1e-4, s.dt)) + 0.5))
     identify(s, lag)
     set_base(s)
     return True

@@ -15,8 +15,9 @@ from ..parameters import meta
 from . import chain_smooth
 from .calibrate import JointCalibrationParams, JointCalibrator
 from .common import IMU_COLUMNS
+from .mounting import mounting_remarks
 from .relative import ChainEstimator, HingeParams, JointHinge
-from .source import JOINT_STATE, NAMED, axis_remarks, mounting_remarks
+from .source import JOINT_STATE, NAMED, axis_remarks
 
 SEGMENT = 2048
 """Samples whose covariances are held at once; the forward pass is run again segment by segment, backwards."""

@@ -9,7 +9,8 @@ import numpy as np
 from ..contract import AlgorithmError, Context, Input, Output, Remark
 from ..parameters import meta
 from . import linear, linear_loop, selfaligned
-from .common import GUESS_DEG, JointEstimator, MergeParams, encoder, imu, joint_name, mounts, sides_of
+from .common import JointEstimator, MergeParams, encoder, imu, joint_name, mounts
+from .mounting import mounting_remarks
 
 TABLE5 = "table 5"
 AXES = ("roll", "pitch", "yaw")
@@ -394,7 +395,8 @@ def set_up_axes(
     s["given_axis"] = s["mount"][:2, flex]
     s["axis"] = s["given_axis"]
     s["up"] = s["given_up"] = s["mount"][:2, 2]
-    s["below"], s["is_knee"] = sides_of(*segments[:2]), joint_name(*segments[:2]) == "knee"
+    s["below"] = 1.0, 0.0 if segments[1] == "foot" else -1.0
+    s["is_knee"] = joint_name(*segments[:2]) == "knee"
     s["learn"] = ("off", "axes", "position").index(p.identify)
     s["stride"], s["fit_at"] = 1, 2.0
     s["sd_gyr"], s["sd_acc"], s["gravity"] = sd_gyr, sd_acc, p.gravity
@@ -406,6 +408,7 @@ def set_up_axes(
                 s["axis"] = s["given_axis"] = np.array(hinge["axes"])
                 s["pos"] = np.array(hinge["positions_m"])
                 s["guessed"] = hinge.get("long_axes_guessed", [False, False])
+                s["pos_sd"], s["skew"] = hinge["position_sd_m"], hinge.get("skewness", 0.0)
                 s["learn"], s["known"] = 0, 1
     elif p.identify == "off" and calibration is not None and not calibration.usable:
         raise AlgorithmError(
@@ -447,48 +450,3 @@ def axis_remarks(s: Any, segments: tuple[str, ...], fatal: bool = True) -> list[
             fatal=fatal,
         )
     ]
-
-
-def mounting_remarks(s: Any, segments: tuple[str, ...]) -> list[Remark]:
-    """Say where what was found contradicts ``axis`` and ``up``, or where these say nothing of the sensors."""
-    guessed = [n for n, g in zip(segments, s["guessed"], strict=False) if g]
-    if guessed:
-        return [
-            Remark(
-                "mounting_guessed",
-                f"{' and '.join(guessed)}: the axis found lies more than 45° off the parameter axis: the long axis is "
-                f"taken from the joint's position (± {GUESS_DEG:.0f}°) and the sign so that a knee bends forward; give "
-                "axis, calibrate with a static span, or take zero=start",
-            )
-        ]
-    # Share of the long axis in the direction from the joint's centre, + where the sensor sits on the right side.
-    sides = [
-        side * float(o @ up) / max(1e-9, float(np.linalg.norm(o)))
-        for side, o, up in zip(s["below"], s["pos"], s["up"], strict=True)
-    ]
-    far = bool(np.linalg.norm(s["pos"], axis=1).min() > 0.05 and s["pos_sd"] < 0.03 and s["below"].all())
-    if far and max(sides) < -0.5:
-        return [
-            Remark(
-                "segments_doubtful",
-                f"the joint lies above the sensor of the {segments[0]} and below that of the {segments[1]}: "
-                "the segments are swapped, or up is wrong for both",
-            )
-        ]
-    if far and min(sides) < -0.5:
-        wrong = segments[int(np.argmin(sides))]
-        return [
-            Remark(
-                "mounting_doubtful",
-                f"the joint lies on the wrong side of the {wrong}'s sensor: it is upside down, or up is wrong",
-            )
-        ]
-    if s["is_knee"] and s["bent"] < -np.radians(15.0):
-        return [
-            Remark(
-                "sign_doubtful",
-                f"the knee bends backward ({np.degrees(s['bent']):.0f}° on average): the sign of axis is wrong for the "
-                f"{segments[0]}, or the segments are swapped",
-            )
-        ]
-    return []
