@@ -38,7 +38,8 @@ def view(
         Write a figure (.png or .svg) instead of opening a viewer.
     kind : str
         Which figure: walk, signals, steps, detector, heading, fixes, transform, map, floor, radio, radiomap,
-        ranges, powers, geometry, threshold, error, joints, jumps, strides.
+        ranges, powers, geometry, threshold, error, joints, cycles, jumps, transitions, attitude, cross, rmse,
+        strides.
     force : bool
         Replace an existing file.
     """

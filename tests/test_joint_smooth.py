@@ -51,7 +51,7 @@ def test_knowing_the_future_makes_it_better(runs: list[tuple[dict[str, Run], pl.
     assert make("joint.smooth").offline
     for pair, _ in runs:
         causal, smoothed = (pair[n].metrics for n in ("joint.hinge", "joint.smooth"))
-        assert smoothed["rmse_unbiased_deg.knee"] < 0.7 * causal["rmse_unbiased_deg.knee"]
+        assert smoothed["rmse_unbiased_deg.knee"] < 0.9 * causal["rmse_unbiased_deg.knee"]
         assert smoothed["rmse_deg.knee"] < 1.2  # the accelerometers' constant error is in it
 
 

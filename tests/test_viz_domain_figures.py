@@ -10,17 +10,18 @@ import marcha.viz as viz
 import numpy as np
 import pytest
 from marcha.recording.errors import UsageError
+from marcha.replay import evaluate
 
 from .viz_walks import indoor, leg, phone
 
 KINDS = {
     "phone": ("signals", "steps", "heading", "fixes", "map", "error"),
-    "indoor": ("floor", "radio", "error", "anchors"),
-    "leg": ("signals", "joints", "cycles", "jumps", "strides"),
+    "indoor": ("floor", "radio", "error"),
+    "leg": ("signals", "joints", "cycles", "jumps", "strides", "transitions", "attitude", "cross", "rmse"),
 }
 
 
-ON_A_FLOOR = ("geometry", "radiomap", "ranges", "powers", "threshold", "triples", "points", "particles")
+ON_A_FLOOR = ("geometry", "radiomap", "ranges", "powers", "threshold")
 """Drawn of a simulated floor, in test_indoor_survey."""
 
 
@@ -85,6 +86,25 @@ def test_shares_of_the_states_add_up(recs: dict[str, mr.Recording]) -> None:
     assert sum(shares) == pytest.approx(100.0, abs=1.5)
 
 
+def test_the_jump_diagram_counts_every_transition(recs: dict[str, mr.Recording]) -> None:
+    rec = recs["leg"]
+    state = rec.table("/estimate/joint_smea/jump")["state"].to_numpy()
+    (ax,) = viz.figure(rec, kind="transitions").axes
+    said = [t.get_text() for t in ax.texts]
+    stays = sum(int(t.split("stays ")[1]) for t in said if "stays" in t)
+    moves = sum(int(t) for t in said if t.isdigit())
+    assert stays == np.sum(np.diff(state) == 0)
+    assert moves == np.sum(np.diff(state) != 0)
+
+
+def test_bars_are_the_metrics(recs: dict[str, mr.Recording]) -> None:
+    (run,) = evaluate(recs["leg"]).runs
+    (ax,) = viz.figure(recs["leg"], kind="rmse").axes
+    heights = sorted(bar.get_height() for bar in ax.patches)  # type: ignore[attr-defined]
+    expected = sorted(v for k, v in run.metrics.items() if k.startswith("rmse_deg."))
+    np.testing.assert_allclose(heights, expected)
+
+
 @pytest.mark.parametrize(("name", "kind"), [("leg", "fixes"), ("phone", "joints"), ("phone", "radio")])
 def test_what_a_recording_has_not_is_said(recs: dict[str, mr.Recording], name: str, kind: str) -> None:
     with pytest.raises(UsageError, match="nothing for this figure"):
@@ -101,14 +121,3 @@ def test_an_unknown_figure_and_several_recordings_are_refused(recs: dict[str, mr
 def test_the_same_bytes_each_time(recs: dict[str, mr.Recording], tmp_path: Path) -> None:
     first = viz.save_figure(recs["leg"], tmp_path / "a.png", kind="joints").read_bytes()
     assert viz.save_figure(recs["leg"], tmp_path / "b.png", kind="joints").read_bytes() == first
-
-
-def test_panels_of_a_walk_are_never_empty(recs: dict[str, mr.Recording]) -> None:
-    """A phone's sigma says nothing of the height and is drawn all the same; no accelerometer, no panel of it."""
-    phone = {ax.get_title(loc="left"): ax for ax in viz.figure(recs["phone"]).axes}
-    (own,) = (ax for title, ax in phone.items() if "1σ" in title)
-    heights = np.concatenate([p.vertices[:, 1] for c in own.collections for p in c.get_paths()])
-    assert np.nanmax(heights) > 0.0
-    bare = {ax.get_title(loc="left") for ax in viz.figure(recs["indoor"]).axes}
-    sensed = any("acc_x" in c.columns for c in recs["indoor"].channels.values())
-    assert any("accelerometer" in title for title in bare) == sensed

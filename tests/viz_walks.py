@@ -215,6 +215,8 @@ def leg(path: Path, seconds: int = 12) -> mr.Recording:
         out.add_table(f"{run}/jump", named, table, metadata={"states": "thigh,shank,all"})
         used = pl.DataFrame({"t_ns": t_ns, "thigh": (state != 1) * 1.0, "shank": (state != 0) * 1.0})
         out.add_table(f"{run}/use", named, used)
+        shares = pl.DataFrame({"t_ns": t_ns, "thigh_roll": 0.3 + 0 * s, "thigh_roll_weighted": 0.2 + 0 * s})
+        out.add_table(f"{run}/cross", named, shares)
         marks = {}
         for name, share in (("hip", 0.0), ("knee", 1.0)):
             marks |= {

@@ -17,10 +17,10 @@ from ..recording import Recording
 from ..recording.errors import UsageError
 from ..replay.evaluate import evaluate
 from ..replay.references import shown_reference
-from . import indoor_figures, plan_figures, style
+from . import indoor_figures, joint_figures, style
 from .canvas import PLACES, is_estimate
 from .curve import Curve
-from .floor import Anchor, plan_of
+from .floor import Anchor, floor_plan, loaders_of
 from .phone_figures import detector, street_map, transform
 from .shapes import ELLIPSE95, circle, geo_circle, metres_a_degree
 from .stance_figures import conditions
@@ -53,7 +53,7 @@ def _topics(rec: Recording, needs: Sequence[str], *schemas: str, role: str = "")
     ]
 
 
-def _require(rec: Recording, what: str, topics: list[str]) -> list[str]:
+def _found(rec: Recording, what: str, topics: list[str]) -> list[str]:
     if not topics:
         raise UsageError(f"{rec.path}: nothing for this figure: no {what}")
     return topics
@@ -98,7 +98,7 @@ def signals(rec: Recording, fig: Figure) -> None:
         for key, unit in (("acc", "m/s²"), ("gyr", "rad/s"))
         for t in _topics(rec, [f"{key}_x"], "sensor_msgs/msg/Imu", role="raw")
     ]
-    _require(rec, "inertial sensor", [t for t, *_ in panels])
+    _found(rec, "inertial sensor", [t for t, *_ in panels])
     for ax, (topic, key, unit) in zip(_rows(fig, len(panels)), panels, strict=True):
         table = rec.table(topic)
         values, t = table.select(f"{key}_{a}" for a in "xyz").to_numpy(), _s(rec, table)
@@ -110,7 +110,7 @@ def signals(rec: Recording, fig: Figure) -> None:
 
 def steps(rec: Recording, fig: Figure) -> None:
     """Steps on the norm of the accelerometer, their lengths, and the distance so far."""
-    topics = _require(rec, "steps", _topics(rec, ["length_m"], "marcha_msgs/msg/Step"))
+    topics = _found(rec, "steps", _topics(rec, ["length_m"], "marcha_msgs/msg/Step"))
     top, lengths, way = _rows(fig, 3)
     sensors = _topics(rec, ["acc_x"], "sensor_msgs/msg/Imu", role="raw")
     norm: tuple[Floats, Floats] | None = None
@@ -126,7 +126,6 @@ def steps(rec: Recording, fig: Figure) -> None:
         lengths.bar(np.arange(1, len(t) + 1), length, color=color, alpha=0.7, label=_owner(topic))
         way.step(np.arange(1, len(t) + 1), np.nancumsum(length), color=color, label=_owner(topic))
     _dress(top, "steps along the norm", TIME, "m/s²")
-    lengths.set_ylim(top=1.3 * lengths.get_ylim()[1])  # room for the legend
     _dress(lengths, "step lengths", "step", "m")
     _dress(way, "distance so far", "step", "m")
 
@@ -140,7 +139,7 @@ def heading(rec: Recording, fig: Figure) -> None:
         for c in rec.channels[t].columns
         if c.endswith("_rad")
     ]
-    _require(rec, "heading", [t for t, _ in headings])
+    _found(rec, "heading", [t for t, _ in headings])
     fields = _topics(rec, ["mag_x"], "sensor_msgs/msg/MagneticField")[:1]
     axes = _rows(fig, 1 + len(fields))
     for ax, topic in zip(axes, fields, strict=False):
@@ -154,12 +153,11 @@ def heading(rec: Recording, fig: Figure) -> None:
         name = f"{_owner(topic)} {column.removesuffix('_rad')}"
         axes[-1].plot(_s(rec, table), turned, color=style.axis_color(i), linewidth=1.0, label=name)
     _dress(axes[-1], "heading (unwrapped)", TIME, "°")
-    axes[-1].legend(fontsize=7, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.18))  # many lines: below
 
 
 def fixes(rec: Recording, fig: Figure) -> None:
     """Fixes with their accuracy, stated tracks and reference: in degrees, and in metres about the first."""
-    topics = _require(rec, "fixes", _topics(rec, ["lat_deg", "lon_deg"]))
+    topics = _found(rec, "fixes", _topics(rec, ["lat_deg", "lon_deg"]))
     fig.set_size_inches(13.0, 6.0)
     degrees, metres = fig.subplots(1, 2)
     first: Floats | None = None
@@ -169,11 +167,11 @@ def fixes(rec: Recording, fig: Figure) -> None:
             continue
         place, color = table.select("lat_deg", "lon_deg").to_numpy(), _color(rec, topic)
         first = np.array(place[0] if first is None else first)
-        line, look = "-" if is_estimate(topic) else "", {"color": color, "label": _owner(topic)}
+        line, known = "-" if is_estimate(topic) else "", {"color": color, "label": _owner(topic)}
         scale = metres_a_degree(first[:1])[0]
-        degrees.plot(place[:, 1], place[:, 0], linestyle=line, marker=".", **look)
+        degrees.plot(place[:, 1], place[:, 0], linestyle=line, marker=".", **known)
         local = (place - first) * scale
-        metres.plot(local[:, 1], local[:, 0], linestyle=line, marker=".", **look)
+        metres.plot(local[:, 1], local[:, 0], linestyle=line, marker=".", **known)
         if "sd_east_m" in table.columns and not is_estimate(topic):
             sd = table.select("sd_east_m", "sd_north_m").to_numpy()
             for ring in (geo_circle(place, sd) - first) * scale:
@@ -188,7 +186,7 @@ def fixes(rec: Recording, fig: Figure) -> None:
 
 
 def _traces(rec: Recording) -> dict[str, Trace]:
-    traces: dict[str, Trace] = {}
+    found: dict[str, Trace] = {}
     for topic in _topics(rec, ["pos_x", "pos_y", "pos_z"], *PLACES):
         table = rec.table(topic)
         position = table.select(pl.col("pos_x", "pos_y"), pl.col("pos_z").fill_nan(0.0)).to_numpy()
@@ -196,13 +194,13 @@ def _traces(rec: Recording) -> dict[str, Trace]:
         trace = Trace(_owner(topic), _color(rec, topic))
         trace.add(table["t_ns"].to_numpy(), position, turn)
         if trace.count:
-            traces[topic] = trace
-    return traces
+            found[topic] = trace
+    return found
 
 
 def floor(rec: Recording, fig: Figure) -> None:
     """Floor plan with anchors by technology, tracks beside the true path, and 95 % ellipses."""
-    plan, traces = plan_of(rec), _traces(rec)
+    plan, traces = floor_plan(loaders_of(rec)), _traces(rec)
     if not plan and not traces:
         raise UsageError(f"{rec.path}: nothing for this figure: neither plan nor anchors nor tracks")
     fig.set_size_inches(9.0, 7.0)
@@ -212,10 +210,8 @@ def floor(rec: Recording, fig: Figure) -> None:
     for line in plan.outlines:
         ax.plot(line[:, 0], line[:, 1], color="#777777", linewidth=1.0)
     for i, kind in enumerate(dict.fromkeys(a.technology for a in plan.anchors.values())):
-        positions = np.array([a.position for a in plan.anchors.values() if a.technology == kind])
-        ax.plot(
-            positions[:, 0], positions[:, 1], "s^vPX*"[i % 6], color="black", label=f"anchors {kind}".strip()
-        )
+        at = np.array([a.position for a in plan.anchors.values() if a.technology == kind])
+        ax.plot(at[:, 0], at[:, 1], "s^vPX*"[i % 6], color="black", label=f"anchors {kind}".strip())
     for topic, trace in traces.items():
         p = trace.positions
         mark = "o" if trace.sparse and is_estimate(topic) else ""
@@ -237,9 +233,9 @@ def _columns(rec: Recording, topic: str) -> tuple[str, ...]:
 
 def radio(rec: Recording, fig: Figure) -> None:
     """Signal strength by anchor: over time, as histogram, and over the true distance with the model."""
-    topic = _require(rec, "radio signals", _topics(rec, ["mac", "rssi_dbm"]))[0]
+    topic = _found(rec, "radio signals", _topics(rec, ["mac", "rssi_dbm"]))[0]
     table = rec.table(topic)
-    anchors = plan_of(rec).anchors
+    anchors = floor_plan(loaders_of(rec)).anchors
     counts = table.group_by("mac").len().sort("len", "mac", descending=[True, False])["mac"].to_list()
     macs = sorted(counts, key=lambda m: m.lower() not in anchors)[:8]
     truth = next((t for k, t in _traces(rec).items() if role_of(k) == "reference"), None)
@@ -249,13 +245,13 @@ def radio(rec: Recording, fig: Figure) -> None:
     for i, mac in enumerate(macs):
         rows = table.filter(pl.col("mac") == mac)
         rssi, color = rows["rssi_dbm"].cast(pl.Float64).to_numpy(), style.run_color(i)
-        look = {"color": color, "label": printable(mac)}
-        axes[0].plot(_s(rec, rows), rssi, ".", markersize=3, **look)
-        axes[1].hist(rssi, bins=np.arange(-110.0, 0.0, 2.0), histtype="step", **look)
+        known = {"color": color, "label": printable(mac)}
+        axes[0].plot(_s(rec, rows), rssi, ".", markersize=3, **known)
+        axes[1].hist(rssi, bins=np.arange(-110.0, 0.0, 2.0), histtype="step", **known)
         anchor: Anchor | None = anchors.get(mac.lower())
         if beside and truth is not None and anchor is not None:
             gone = np.linalg.norm(truth.at(rows["t_ns"].to_numpy()) - anchor.position, axis=1)
-            axes[2].plot(gone, rssi, ".", markersize=3, **look)
+            axes[2].plot(gone, rssi, ".", markersize=3, **known)
             d = np.geomspace(0.5, max(float(gone.max()), 1.0), 60)
             axes[2].plot(d, anchor.p_d0 - 10 * anchor.eta * np.log10(d), color=color, linewidth=1.0)
     _dress(
@@ -274,25 +270,25 @@ def radio(rec: Recording, fig: Figure) -> None:
 def error(rec: Recording, fig: Figure) -> None:
     """Distance to the reference over time, and its distribution; positions as they are, not aligned."""
     traces = _traces(rec)
-    results = {}
+    found = {}
     for topic, trace in traces.items():
         truth = (
             shown_reference(rec.channels, topic.split("/")[2], rec.metadata) if is_estimate(topic) else None
         )
         result = compared(trace, traces[truth], "none") if truth in traces else None
         if result is not None:
-            results[topic] = result
-    _require(rec, "track with a reference", list(results))
+            found[topic] = result
+    _found(rec, "track with a reference", list(found))
     fig.set_size_inches(12.0, 4.5)
     over, share = fig.subplots(1, 2)
-    for topic, result in results.items():
+    for topic, result in found.items():
         far, color = distance(result), traces[topic].color
         over.plot((result.t_ns - (rec.start_ns or 0)) / 1e9, far, color=color, label=_owner(topic))
         ordered = np.sort(far)
-        percent = 100.0 * np.arange(1, len(far) + 1) / len(far)
+        at = 100.0 * np.arange(1, len(far) + 1) / len(far)
         median, p95 = np.percentile(far, [50, 95])
         name = f"{_owner(topic)}: mean {far.mean():.2f}, median {median:.2f}, 95 % {p95:.2f} m"
-        share.step(ordered, percent, color=color, where="post", label=name)
+        share.step(ordered, at, color=color, where="post", label=name)
     _dress(over, "error of the position (not aligned)", TIME, "m", legend=False)
     _dress(share, "distribution", "error (m)", "% of the samples")
 
@@ -300,11 +296,12 @@ def error(rec: Recording, fig: Figure) -> None:
 def joints(rec: Recording, fig: Figure) -> None:
     """Joint angles beside reference and encoder, and the error within its stated ±1σ."""
     angles: dict[str, list[str]] = {}
-    for topic in _require(rec, "joint angles", _topics(rec, [], JOINT)):
+    for topic in _found(rec, "joint angles", _topics(rec, [], JOINT)):
         for name in rec.channels[topic].columns:
             if not name.endswith((".vel", ".effort")):
                 angles.setdefault(name, []).append(topic)
     estimated = {j for j, topics in angles.items() if any(is_estimate(t) for t in topics)}
+    angles = {j: topics for j, topics in angles.items() if not estimated or j in estimated}
     axes = iter(_rows(fig, len(angles) + len(estimated)))
     for joint, topics in angles.items():
         ax = next(axes)
@@ -320,16 +317,20 @@ def joints(rec: Recording, fig: Figure) -> None:
             continue
         below = next(axes)
         truth = next((t for t in curves if not is_estimate(t)), None)
+        widest = 1.0
         for topic in [t for t in curves if is_estimate(t) and truth]:
             t_ns, wrong = difference(curves[topic], curves[truth or ""])
             t, color = (t_ns - (rec.start_ns or 0)) / 1e9, _color(rec, topic)
             rmse = float(np.sqrt(np.mean(wrong**2))) if len(wrong) else np.nan
+            widest = max(widest, 1.2 * float(np.percentile(np.abs(wrong), 99.5)) if len(wrong) else 0.0)
             below.plot(t, wrong, color=color, linewidth=1.0, label=f"{_owner(topic)}: RMSE {rmse:.2f}°")
             stated = f"{topic.rpartition('/')[0]}/sigma"
             if joint in _columns(rec, stated):
                 table = rec.table(stated)
                 sd = np.degrees(table[joint].to_numpy())
                 below.fill_between(_s(rec, table), -sd, sd, color=color, alpha=0.2, linewidth=0)
+                widest = max(widest, 1.2 * float(np.nanmedian(sd)))
+        below.set_ylim(-widest, widest)
         _dress(below, f"{printed} error to {_owner(truth or 'no reference')} (area: ±1σ)", TIME, "°")
 
 
@@ -338,7 +339,7 @@ def jumps(rec: Recording, fig: Figure) -> None:
     topics = [
         t for t in _topics(rec, ["state"], NAMED, role="estimate") if "states" in rec.channels[t].metadata
     ]
-    _require(rec, "named states (metadata `states` of a channel with a column `state`)", topics)
+    _found(rec, "named states (metadata `states` of a channel with a column `state`)", topics)
     for ax, topic in zip(_rows(fig, len(topics)), topics, strict=True):
         names = [printable(n.strip()) for n in rec.channels[topic].metadata["states"].split(",")]
         table = rec.table(topic).filter(pl.col("state").is_finite())
@@ -356,18 +357,18 @@ def jumps(rec: Recording, fig: Figure) -> None:
 
 def cycles(rec: Recording, fig: Figure) -> None:
     """Joint angles over the gait cycle: mean and standard deviation of estimate and reference, every cycle's error."""
-    results = [
+    found = [
         (run.run, joint)
         for run in (evaluate(rec, intervals=False).runs if any(map(is_estimate, rec.channels)) else [])
         for joint in run.cycles
     ]
-    if not results:
+    if not found:
         raise UsageError(
             f"{rec.path}: nothing for this figure: no joint angle with a reference over two cycles"
         )
     percent = np.arange(101)
-    axes = _rows(fig, 2 * len(results))
-    for (run, joint), ax, below in zip(results, axes[::2], axes[1::2], strict=True):
+    axes = _rows(fig, 2 * len(found))
+    for (run, joint), ax, below in zip(found, axes[::2], axes[1::2], strict=True):
         color = _color(rec, f"/estimate/{run}/joint")
         curves = (
             (ax, joint.reference_mean, joint.reference_sd, style.REFERENCE, "reference"),
@@ -401,11 +402,11 @@ FIGURES: dict[str, Callable[[Recording, Any], None]] = {
     "joints": joints,
     "cycles": cycles,
     "jumps": jumps,
+    "transitions": joint_figures.transitions,
+    "attitude": joint_figures.attitude,
+    "cross": joint_figures.cross,
+    "rmse": joint_figures.rmse,
     "strides": strides,
-    "anchors": plan_figures.anchors,
-    "triples": plan_figures.triples,
-    "points": plan_figures.points,
-    "particles": plan_figures.particles,
     "geometry": indoor_figures.geometry,
     "radiomap": indoor_figures.radiomap,
     "ranges": indoor_figures.ranges,

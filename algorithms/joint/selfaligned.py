@@ -1,8 +1,8 @@
 """The angle of a hinge from two sensors alone: axes and position found on the way, angle by eqs 72–77.
 
-Of samples with both sensors valid every ``stride``-th is kept; when the store is full, every second is thrown away
-and the stride doubles, so that it always covers the whole run. The axes are identified anew (:mod:`.axisfit`)
-after 2 s and then each time the run is a quarter longer.
+Of samples with both sensors valid, in motion, every ``stride``-th is kept; when the store is full, every second is
+thrown away and the stride doubles, so that it always covers the whole run. The axes are identified anew
+(:mod:`.axisfit`) after 2 s of motion and then each time the motion is a quarter longer.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ FIELDS: list[Any] = [
     ("stride", "i8"),
     ("skip", "i8"),
     ("learn", "i8"),  # 0: axes are given; 1: axes; 2: axes and position
-    ("elapsed", "f8"),
+    ("elapsed", "f8"),  # in motion
     ("fit_at", "f8"),
     ("fits", "i8"),
     ("known", "i8"),  # whether the axes are usable: given, or identified with a good verdict
@@ -134,14 +134,16 @@ def at_rest(s: Any) -> bool:
 @compiled
 def watch(s: Any) -> bool:
     """Keep the sample given out; return True where the axes were identified anew with it."""
-    s.elapsed += s.dt
     if s.valid[0] == 0 or s.valid[1] == 0:
         return False
     for i in range(2):
         for m in range(3):
             s.whole[i, m] += s.turn[i, m]
+    if at_rest(s):
+        return False
+    s.elapsed += s.dt
     s.skip += 1
-    if s.slope[0] == 0 or s.slope[1] == 0 or s.skip < s.stride or at_rest(s):
+    if s.slope[0] == 0 or s.slope[1] == 0 or s.skip < s.stride:
         return False
     s.skip = 0
     k = s.kept
