@@ -16,12 +16,12 @@ from .viz_walks import indoor, leg, phone
 
 KINDS = {
     "phone": ("signals", "steps", "heading", "fixes", "map", "error"),
-    "indoor": ("floor", "radio", "error"),
+    "indoor": ("floor", "radio", "error", "anchors"),
     "leg": ("signals", "joints", "cycles", "jumps", "strides", "transitions", "attitude", "cross", "rmse"),
 }
 
 
-ON_A_FLOOR = ("geometry", "radiomap", "ranges", "powers", "threshold")
+ON_A_FLOOR = ("geometry", "radiomap", "ranges", "powers", "threshold", "triples", "points", "particles")
 """Drawn of a simulated floor, in test_indoor_survey."""
 
 
@@ -121,3 +121,14 @@ def test_an_unknown_figure_and_several_recordings_are_refused(recs: dict[str, mr
 def test_the_same_bytes_each_time(recs: dict[str, mr.Recording], tmp_path: Path) -> None:
     first = viz.save_figure(recs["leg"], tmp_path / "a.png", kind="joints").read_bytes()
     assert viz.save_figure(recs["leg"], tmp_path / "b.png", kind="joints").read_bytes() == first
+
+
+def test_panels_of_a_walk_are_never_empty(recs: dict[str, mr.Recording]) -> None:
+    """A phone's sigma says nothing of the height and is drawn all the same; no accelerometer, no panel of it."""
+    phone = {ax.get_title(loc="left"): ax for ax in viz.figure(recs["phone"]).axes}
+    (own,) = (ax for title, ax in phone.items() if "1σ" in title)
+    heights = np.concatenate([p.vertices[:, 1] for c in own.collections for p in c.get_paths()])
+    assert np.nanmax(heights) > 0.0
+    bare = {ax.get_title(loc="left") for ax in viz.figure(recs["indoor"]).axes}
+    sensed = any("acc_x" in c.columns for c in recs["indoor"].channels.values())
+    assert any("accelerometer" in title for title in bare) == sensed

@@ -17,10 +17,10 @@ from ..recording import Recording
 from ..recording.errors import UsageError
 from ..replay.evaluate import evaluate
 from ..replay.references import shown_reference
-from . import indoor_figures, joint_figures, style
+from . import indoor_figures, joint_figures, plan_figures, style
 from .canvas import PLACES, is_estimate
 from .curve import Curve
-from .floor import Anchor, floor_plan, loaders_of
+from .floor import Anchor, plan_of
 from .phone_figures import detector, street_map, transform
 from .shapes import ELLIPSE95, circle, geo_circle, metres_a_degree
 from .stance_figures import conditions
@@ -53,7 +53,7 @@ def _topics(rec: Recording, needs: Sequence[str], *schemas: str, role: str = "")
     ]
 
 
-def _found(rec: Recording, what: str, topics: list[str]) -> list[str]:
+def _require(rec: Recording, what: str, topics: list[str]) -> list[str]:
     if not topics:
         raise UsageError(f"{rec.path}: nothing for this figure: no {what}")
     return topics
@@ -98,7 +98,7 @@ def signals(rec: Recording, fig: Figure) -> None:
         for key, unit in (("acc", "m/s²"), ("gyr", "rad/s"))
         for t in _topics(rec, [f"{key}_x"], "sensor_msgs/msg/Imu", role="raw")
     ]
-    _found(rec, "inertial sensor", [t for t, *_ in panels])
+    _require(rec, "inertial sensor", [t for t, *_ in panels])
     for ax, (topic, key, unit) in zip(_rows(fig, len(panels)), panels, strict=True):
         table = rec.table(topic)
         values, t = table.select(f"{key}_{a}" for a in "xyz").to_numpy(), _s(rec, table)
@@ -110,7 +110,7 @@ def signals(rec: Recording, fig: Figure) -> None:
 
 def steps(rec: Recording, fig: Figure) -> None:
     """Steps on the norm of the accelerometer, their lengths, and the distance so far."""
-    topics = _found(rec, "steps", _topics(rec, ["length_m"], "marcha_msgs/msg/Step"))
+    topics = _require(rec, "steps", _topics(rec, ["length_m"], "marcha_msgs/msg/Step"))
     top, lengths, way = _rows(fig, 3)
     sensors = _topics(rec, ["acc_x"], "sensor_msgs/msg/Imu", role="raw")
     norm: tuple[Floats, Floats] | None = None
@@ -126,6 +126,7 @@ def steps(rec: Recording, fig: Figure) -> None:
         lengths.bar(np.arange(1, len(t) + 1), length, color=color, alpha=0.7, label=_owner(topic))
         way.step(np.arange(1, len(t) + 1), np.nancumsum(length), color=color, label=_owner(topic))
     _dress(top, "steps along the norm", TIME, "m/s²")
+    lengths.set_ylim(top=1.3 * lengths.get_ylim()[1])  # room for the legend
     _dress(lengths, "step lengths", "step", "m")
     _dress(way, "distance so far", "step", "m")
 
@@ -139,7 +140,7 @@ def heading(rec: Recording, fig: Figure) -> None:
         for c in rec.channels[t].columns
         if c.endswith("_rad")
     ]
-    _found(rec, "heading", [t for t, _ in headings])
+    _require(rec, "heading", [t for t, _ in headings])
     fields = _topics(rec, ["mag_x"], "sensor_msgs/msg/MagneticField")[:1]
     axes = _rows(fig, 1 + len(fields))
     for ax, topic in zip(axes, fields, strict=False):
@@ -153,11 +154,12 @@ def heading(rec: Recording, fig: Figure) -> None:
         name = f"{_owner(topic)} {column.removesuffix('_rad')}"
         axes[-1].plot(_s(rec, table), turned, color=style.axis_color(i), linewidth=1.0, label=name)
     _dress(axes[-1], "heading (unwrapped)", TIME, "°")
+    axes[-1].legend(fontsize=7, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.18))  # many lines: below
 
 
 def fixes(rec: Recording, fig: Figure) -> None:
     """Fixes with their accuracy, stated tracks and reference: in degrees, and in metres about the first."""
-    topics = _found(rec, "fixes", _topics(rec, ["lat_deg", "lon_deg"]))
+    topics = _require(rec, "fixes", _topics(rec, ["lat_deg", "lon_deg"]))
     fig.set_size_inches(13.0, 6.0)
     degrees, metres = fig.subplots(1, 2)
     first: Floats | None = None
@@ -167,11 +169,11 @@ def fixes(rec: Recording, fig: Figure) -> None:
             continue
         place, color = table.select("lat_deg", "lon_deg").to_numpy(), _color(rec, topic)
         first = np.array(place[0] if first is None else first)
-        line, known = "-" if is_estimate(topic) else "", {"color": color, "label": _owner(topic)}
+        line, look = "-" if is_estimate(topic) else "", {"color": color, "label": _owner(topic)}
         scale = metres_a_degree(first[:1])[0]
-        degrees.plot(place[:, 1], place[:, 0], linestyle=line, marker=".", **known)
+        degrees.plot(place[:, 1], place[:, 0], linestyle=line, marker=".", **look)
         local = (place - first) * scale
-        metres.plot(local[:, 1], local[:, 0], linestyle=line, marker=".", **known)
+        metres.plot(local[:, 1], local[:, 0], linestyle=line, marker=".", **look)
         if "sd_east_m" in table.columns and not is_estimate(topic):
             sd = table.select("sd_east_m", "sd_north_m").to_numpy()
             for ring in (geo_circle(place, sd) - first) * scale:
@@ -186,7 +188,7 @@ def fixes(rec: Recording, fig: Figure) -> None:
 
 
 def _traces(rec: Recording) -> dict[str, Trace]:
-    found: dict[str, Trace] = {}
+    traces: dict[str, Trace] = {}
     for topic in _topics(rec, ["pos_x", "pos_y", "pos_z"], *PLACES):
         table = rec.table(topic)
         position = table.select(pl.col("pos_x", "pos_y"), pl.col("pos_z").fill_nan(0.0)).to_numpy()
@@ -194,13 +196,13 @@ def _traces(rec: Recording) -> dict[str, Trace]:
         trace = Trace(_owner(topic), _color(rec, topic))
         trace.add(table["t_ns"].to_numpy(), position, turn)
         if trace.count:
-            found[topic] = trace
-    return found
+            traces[topic] = trace
+    return traces
 
 
 def floor(rec: Recording, fig: Figure) -> None:
     """Floor plan with anchors by technology, tracks beside the true path, and 95 % ellipses."""
-    plan, traces = floor_plan(loaders_of(rec)), _traces(rec)
+    plan, traces = plan_of(rec), _traces(rec)
     if not plan and not traces:
         raise UsageError(f"{rec.path}: nothing for this figure: neither plan nor anchors nor tracks")
     fig.set_size_inches(9.0, 7.0)
@@ -210,8 +212,10 @@ def floor(rec: Recording, fig: Figure) -> None:
     for line in plan.outlines:
         ax.plot(line[:, 0], line[:, 1], color="#777777", linewidth=1.0)
     for i, kind in enumerate(dict.fromkeys(a.technology for a in plan.anchors.values())):
-        at = np.array([a.position for a in plan.anchors.values() if a.technology == kind])
-        ax.plot(at[:, 0], at[:, 1], "s^vPX*"[i % 6], color="black", label=f"anchors {kind}".strip())
+        positions = np.array([a.position for a in plan.anchors.values() if a.technology == kind])
+        ax.plot(
+            positions[:, 0], positions[:, 1], "s^vPX*"[i % 6], color="black", label=f"anchors {kind}".strip()
+        )
     for topic, trace in traces.items():
         p = trace.positions
         mark = "o" if trace.sparse and is_estimate(topic) else ""
@@ -233,9 +237,9 @@ def _columns(rec: Recording, topic: str) -> tuple[str, ...]:
 
 def radio(rec: Recording, fig: Figure) -> None:
     """Signal strength by anchor: over time, as histogram, and over the true distance with the model."""
-    topic = _found(rec, "radio signals", _topics(rec, ["mac", "rssi_dbm"]))[0]
+    topic = _require(rec, "radio signals", _topics(rec, ["mac", "rssi_dbm"]))[0]
     table = rec.table(topic)
-    anchors = floor_plan(loaders_of(rec)).anchors
+    anchors = plan_of(rec).anchors
     counts = table.group_by("mac").len().sort("len", "mac", descending=[True, False])["mac"].to_list()
     macs = sorted(counts, key=lambda m: m.lower() not in anchors)[:8]
     truth = next((t for k, t in _traces(rec).items() if role_of(k) == "reference"), None)
@@ -245,13 +249,13 @@ def radio(rec: Recording, fig: Figure) -> None:
     for i, mac in enumerate(macs):
         rows = table.filter(pl.col("mac") == mac)
         rssi, color = rows["rssi_dbm"].cast(pl.Float64).to_numpy(), style.run_color(i)
-        known = {"color": color, "label": printable(mac)}
-        axes[0].plot(_s(rec, rows), rssi, ".", markersize=3, **known)
-        axes[1].hist(rssi, bins=np.arange(-110.0, 0.0, 2.0), histtype="step", **known)
+        look = {"color": color, "label": printable(mac)}
+        axes[0].plot(_s(rec, rows), rssi, ".", markersize=3, **look)
+        axes[1].hist(rssi, bins=np.arange(-110.0, 0.0, 2.0), histtype="step", **look)
         anchor: Anchor | None = anchors.get(mac.lower())
         if beside and truth is not None and anchor is not None:
             gone = np.linalg.norm(truth.at(rows["t_ns"].to_numpy()) - anchor.position, axis=1)
-            axes[2].plot(gone, rssi, ".", markersize=3, **known)
+            axes[2].plot(gone, rssi, ".", markersize=3, **look)
             d = np.geomspace(0.5, max(float(gone.max()), 1.0), 60)
             axes[2].plot(d, anchor.p_d0 - 10 * anchor.eta * np.log10(d), color=color, linewidth=1.0)
     _dress(
@@ -270,25 +274,25 @@ def radio(rec: Recording, fig: Figure) -> None:
 def error(rec: Recording, fig: Figure) -> None:
     """Distance to the reference over time, and its distribution; positions as they are, not aligned."""
     traces = _traces(rec)
-    found = {}
+    results = {}
     for topic, trace in traces.items():
         truth = (
             shown_reference(rec.channels, topic.split("/")[2], rec.metadata) if is_estimate(topic) else None
         )
         result = compared(trace, traces[truth], "none") if truth in traces else None
         if result is not None:
-            found[topic] = result
-    _found(rec, "track with a reference", list(found))
+            results[topic] = result
+    _require(rec, "track with a reference", list(results))
     fig.set_size_inches(12.0, 4.5)
     over, share = fig.subplots(1, 2)
-    for topic, result in found.items():
+    for topic, result in results.items():
         far, color = distance(result), traces[topic].color
         over.plot((result.t_ns - (rec.start_ns or 0)) / 1e9, far, color=color, label=_owner(topic))
         ordered = np.sort(far)
-        at = 100.0 * np.arange(1, len(far) + 1) / len(far)
+        percent = 100.0 * np.arange(1, len(far) + 1) / len(far)
         median, p95 = np.percentile(far, [50, 95])
         name = f"{_owner(topic)}: mean {far.mean():.2f}, median {median:.2f}, 95 % {p95:.2f} m"
-        share.step(ordered, at, color=color, where="post", label=name)
+        share.step(ordered, percent, color=color, where="post", label=name)
     _dress(over, "error of the position (not aligned)", TIME, "m", legend=False)
     _dress(share, "distribution", "error (m)", "% of the samples")
 
@@ -296,7 +300,7 @@ def error(rec: Recording, fig: Figure) -> None:
 def joints(rec: Recording, fig: Figure) -> None:
     """Joint angles beside reference and encoder, and the error within its stated ±1σ."""
     angles: dict[str, list[str]] = {}
-    for topic in _found(rec, "joint angles", _topics(rec, [], JOINT)):
+    for topic in _require(rec, "joint angles", _topics(rec, [], JOINT)):
         for name in rec.channels[topic].columns:
             if not name.endswith((".vel", ".effort")):
                 angles.setdefault(name, []).append(topic)
@@ -339,7 +343,7 @@ def jumps(rec: Recording, fig: Figure) -> None:
     topics = [
         t for t in _topics(rec, ["state"], NAMED, role="estimate") if "states" in rec.channels[t].metadata
     ]
-    _found(rec, "named states (metadata `states` of a channel with a column `state`)", topics)
+    _require(rec, "named states (metadata `states` of a channel with a column `state`)", topics)
     for ax, topic in zip(_rows(fig, len(topics)), topics, strict=True):
         names = [printable(n.strip()) for n in rec.channels[topic].metadata["states"].split(",")]
         table = rec.table(topic).filter(pl.col("state").is_finite())
@@ -357,18 +361,18 @@ def jumps(rec: Recording, fig: Figure) -> None:
 
 def cycles(rec: Recording, fig: Figure) -> None:
     """Joint angles over the gait cycle: mean and standard deviation of estimate and reference, every cycle's error."""
-    found = [
+    results = [
         (run.run, joint)
         for run in (evaluate(rec, intervals=False).runs if any(map(is_estimate, rec.channels)) else [])
         for joint in run.cycles
     ]
-    if not found:
+    if not results:
         raise UsageError(
             f"{rec.path}: nothing for this figure: no joint angle with a reference over two cycles"
         )
     percent = np.arange(101)
-    axes = _rows(fig, 2 * len(found))
-    for (run, joint), ax, below in zip(found, axes[::2], axes[1::2], strict=True):
+    axes = _rows(fig, 2 * len(results))
+    for (run, joint), ax, below in zip(results, axes[::2], axes[1::2], strict=True):
         color = _color(rec, f"/estimate/{run}/joint")
         curves = (
             (ax, joint.reference_mean, joint.reference_sd, style.REFERENCE, "reference"),
@@ -407,6 +411,10 @@ FIGURES: dict[str, Callable[[Recording, Any], None]] = {
     "cross": joint_figures.cross,
     "rmse": joint_figures.rmse,
     "strides": strides,
+    "anchors": plan_figures.anchors,
+    "triples": plan_figures.triples,
+    "points": plan_figures.points,
+    "particles": plan_figures.particles,
     "geometry": indoor_figures.geometry,
     "radiomap": indoor_figures.radiomap,
     "ranges": indoor_figures.ranges,

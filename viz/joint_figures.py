@@ -117,8 +117,8 @@ def attitude(rec: Recording, fig: Figure) -> None:
                     label=printable(run),
                 )
         _frame(ax, shown)
-        known = "" if any(line.get_label() == "reference" for line in ax.get_lines()) else ", no reference"
-        _dress(ax, f"{printable(segment)} {axis}{known}", TIME, "°")
+        note = "" if any(line.get_label() == "reference" for line in ax.get_lines()) else ", no reference"
+        _dress(ax, f"{printable(segment)} {axis}{note}", TIME, "°")
 
 
 def _frame(ax: Axes, curves: list[Floats]) -> None:
@@ -145,12 +145,12 @@ def transitions(rec: Recording, fig: Figure) -> None:
         np.add.at(count, (state[:-1], state[1:]), 1)
         colors = [style.run_color(k) for k in seen]
         turn = np.pi / 2 - 2 * np.pi * np.arange(len(names)) / len(names)
-        at = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        place = np.stack([np.cos(turn), np.sin(turn)], axis=1)
         for a, b in zip(*np.nonzero(count * (1 - np.eye(len(names), dtype=int))), strict=True):
             ax.annotate(
                 "",
-                at[b],
-                at[a],
+                place[b],
+                place[a],
                 arrowprops={
                     "arrowstyle": "->",
                     "connectionstyle": "arc3,rad=0.18",
@@ -158,14 +158,14 @@ def transitions(rec: Recording, fig: Figure) -> None:
                     "shrinkB": 36,
                 },
             )
-            way = at[b] - at[a]
-            side = 0.5 * (at[a] + at[b]) + 0.14 * np.array([way[1], -way[0]])
+            way = place[b] - place[a]
+            side = 0.5 * (place[a] + place[b]) + 0.14 * np.array([way[1], -way[0]])
             ax.text(*side, str(count[a, b]), ha="center", va="center", fontsize=9)
         for k, name in enumerate(names):
             share = 100.0 * float(np.mean(state == k)) if len(state) else 0.0
-            ax.scatter(*at[k], s=4200, color=colors[k], alpha=0.35, zorder=2)
+            ax.scatter(*place[k], s=4200, color=colors[k], alpha=0.35, zorder=2)
             text = f"{name}\n{share:.0f} %\nstays {count[k, k]}"
-            ax.text(*at[k], text, ha="center", va="center", fontsize=9, zorder=3)
+            ax.text(*place[k], text, ha="center", va="center", fontsize=9, zorder=3)
         ax.set(xlim=(-1.6, 1.6), ylim=(-1.6, 1.6), aspect="equal", xticks=[], yticks=[])
         ax.set_xlabel("arrows: number of changes, from sample to sample", fontsize=9)
         ax.set_title(f"{printable(run)}: jumps over {len(state)} samples", fontsize=10, loc="left")
@@ -195,40 +195,40 @@ def cross(rec: Recording, fig: Figure) -> None:
 
 
 def running_mean(t: Floats, values: Floats, width_s: float) -> Floats:
-    """Return the mean of the finite values within ∓ half of ``width_s``; NaN where there is none."""
+    """Return the mean (n,) of the finite values (n,) within ∓ half of ``width_s``; NaN where there is none."""
     good = np.isfinite(values)
     total = np.concatenate([[0.0], np.cumsum(np.where(good, values, 0.0))])
     count = np.concatenate([[0], np.cumsum(good)])
     a, b = np.searchsorted(t, t - 0.5 * width_s), np.searchsorted(t, t + 0.5 * width_s, side="right")
-    known = count[b] > count[a]
-    return np.where(known, (total[b] - total[a]) / np.maximum(1, count[b] - count[a]), np.nan)
+    some = count[b] > count[a]
+    return np.where(some, (total[b] - total[a]) / np.maximum(1, count[b] - count[a]), np.nan)
 
 
 def rmse(rec: Recording, fig: Figure) -> None:
     """RMSE of every run as bars: joints, and roll and pitch of the segments, to the reference."""
-    found: dict[str, dict[str, float]] = {}
+    errors: dict[str, dict[str, float]] = {}
     runs = evaluate(rec, intervals=False).runs if any(map(is_estimate, rec.channels)) else []
     for run in runs:
         for metric, value in run.metrics.items():
             if metric.startswith("rmse_deg."):
-                found.setdefault(metric.partition(".")[2], {})[run.run] = float(value)
-    if not found:
+                errors.setdefault(metric.partition(".")[2], {})[run.run] = float(value)
+    if not errors:
         raise _nothing(rec, "joint angle or attitude with a reference")
-    owners = list(dict.fromkeys(run for values in found.values() for run in values))
-    fig.set_size_inches(max(6.0, 1.2 * len(found) * max(1, len(owners)) ** 0.5 + 3.0), 4.6)
+    owners = list(dict.fromkeys(run for values in errors.values() for run in values))
+    fig.set_size_inches(max(6.0, 1.2 * len(errors) * max(1, len(owners)) ** 0.5 + 3.0), 4.6)
     ax, width = fig.subplots(), 0.8 / len(owners)
     for i, run in enumerate(owners):
-        at = [k for k, values in enumerate(found.values()) if run in values]
-        height = [values[run] for values in found.values() if run in values]
+        places = [k for k, values in enumerate(errors.values()) if run in values]
+        height = [values[run] for values in errors.values() if run in values]
         bars = ax.bar(
-            np.array(at) + (i - 0.5 * (len(owners) - 1)) * width,
+            np.array(places) + (i - 0.5 * (len(owners) - 1)) * width,
             height,
             0.92 * width,
             color=_color(rec, run),
             label=printable(run),
         )
         ax.bar_label(bars, fmt="%.2f", fontsize=7)
-    ax.set_xticks(range(len(found)), [printable(n).replace("_", "\n") for n in found])
+    ax.set_xticks(range(len(errors)), [printable(n).replace("_", "\n") for n in errors])
     _dress(ax, "RMSE to the reference, bias included, after 1.2 s", "", "°")
     ax.set_xlabel("angle", fontsize=9)
     ax.margins(y=0.2)

@@ -229,7 +229,10 @@ class JointCalibrator(Calibrator):
         }
 
     def sign(self, upper: str, joint: str, axis: FloatArray, skew: float) -> float:
-        """Return the common sign of both axes: the parameter's; where it lies far off, that of a knee's swings."""
+        """Return the common sign of both axes, from the upper one (3,).
+
+        It is the parameter's; where that lies far off, that of a knee's swings.
+        """
         along = float(axis @ given_mount(self.params, upper)[0])
         if abs(along) < NEAR and joint == "knee" and abs(skew) > SKEWED:
             return 1.0 if skew > 0.0 else -1.0
@@ -253,7 +256,7 @@ class JointCalibrator(Calibrator):
         self, hinges: Sequence[dict[str, Any]], remarks: list[str], stood: Collection[str]
     ) -> dict[str, FloatArray]:
         """Return the long axes of both segments of every usable hinge, and remark what is guessed."""
-        found: dict[str, FloatArray] = {}
+        long: dict[str, FloatArray] = {}
         for hinge in hinges:
             if not hinge["usable"]:
                 continue
@@ -262,14 +265,14 @@ class JointCalibrator(Calibrator):
             up, guessed = long_axes(np.array(hinge["axes"]), mountings, np.array(hinge["mean_force_m_s2"]))
             hinge["long_axes_guessed"] = [g and s not in stood for g, s in zip(guessed, pair, strict=True)]
             for segment, one, guess in zip(pair, up, guessed, strict=True):
-                if segment not in found or hinge["joint"] == "knee":
-                    found[segment] = one
+                if segment not in long or hinge["joint"] == "knee":
+                    long[segment] = one
                 if guess and segment not in stood:
                     remarks.append(
                         f"{segment}: its axis lies more than 45° off axis={self.params.axis}: zero and sign of the "
                         f"angle are guesses (long axis ± {GUESS_DEG:.0f}°); give axis and up, or stand in a static span"
                     )
-        return found
+        return long
 
     def standing(
         self, segment: str, poses: Sequence[dict[str, Any]], remarks: list[str]

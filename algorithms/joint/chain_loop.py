@@ -12,7 +12,7 @@ from .chain import FREE, HINGE, measure_angles, set_zero, stated_sd, step
 
 
 @compiled
-def quaternion(r: FloatArray, out: FloatArray, at: int) -> None:
+def quaternion(r: FloatArray, out: FloatArray, column: int) -> None:
     """Write the quaternion (wxyz, w ≥ 0) of a rotation; Shepperd's method."""
     a, b, c = r[0, 0], r[1, 1], r[2, 2]
     trace = a + b + c
@@ -26,7 +26,7 @@ def quaternion(r: FloatArray, out: FloatArray, at: int) -> None:
         w, x, y, z = r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1.0 - a - b + c
     k = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
     k = -k if w < 0.0 else k
-    out[at], out[at + 1], out[at + 2], out[at + 3] = w * k, x * k, y * k, z * k
+    out[column], out[column + 1], out[column + 2], out[column + 3] = w * k, x * k, y * k, z * k
 
 
 @compiled
@@ -36,37 +36,37 @@ def emit(s: Any, out: FloatArray) -> None:
         out[c] = math.nan
     measure_angles(s)
     set_zero(s)
-    at = 0
+    column = 0
     for i in range(s.n):
         if s.valid[i] == 1:
-            quaternion(s.rot[i], out, at)
-        at += 4
+            quaternion(s.rot[i], out, column)
+        column += 4
     for j in range(s.n - 1):
         both = s.valid[j] == 1 and s.valid[j + 1] == 1
         for k in range(1 if s.type[j] == HINGE else 3):
             if both:
-                out[at] = s.angle[j, k]
+                out[column] = s.angle[j, k]
                 if k == 0:
-                    out[at] -= s.zero_sum[j] / max(1, s.zero_count[j])
-            at += 1
+                    out[column] -= s.zero_sum[j] / max(1, s.zero_count[j])
+            column += 1
     for j in range(s.n - 1):
         if s.valid[j] == 1 and s.valid[j + 1] == 1:
-            out[at] = stated_sd(s, j)
-        at += 1
+            out[column] = stated_sd(s, j)
+        column += 1
     for i in range(s.n):
         if s.valid[i] == 1:
-            out[at] = math.sqrt(max(0.0, 0.5 * (s.P[6 * i, 6 * i] + s.P[6 * i + 1, 6 * i + 1])))
-        at += 1
+            out[column] = math.sqrt(max(0.0, 0.5 * (s.P[6 * i, 6 * i] + s.P[6 * i + 1, 6 * i + 1])))
+        column += 1
     for i in range(s.n):
         for k in range(3):
             if s.valid[i] == 1:
-                out[at] = s.bias[i, k]
-            at += 1
+                out[column] = s.bias[i, k]
+            column += 1
     for j in range(s.n - 1):
         for i in range(2):
             for m in range(3):
-                out[at] = s.j[j, i, m] if s.type[j] != FREE else math.nan
-                at += 1
+                out[column] = s.j[j, i, m] if s.type[j] != FREE else math.nan
+                column += 1
 
 
 @compiled

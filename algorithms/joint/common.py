@@ -78,14 +78,14 @@ def vector(text: str, name: str) -> FloatArray:
     if word in ("x", "y", "z"):
         return sign * np.eye(3)["xyz".index(word)]
     try:
-        found = np.array([float(part) for part in plain.replace(",", " ").split()])
+        values = np.array([float(part) for part in plain.replace(",", " ").split()])
     except ValueError:
-        found = np.zeros(0)
-    if found.shape != (3,) or not np.isfinite(found).all() or np.linalg.norm(found) < 1e-6:
+        values = np.zeros(0)
+    if values.shape != (3,) or not np.isfinite(values).all() or np.linalg.norm(values) < 1e-6:
         raise AlgorithmError(
             f"{name} = {text!r} is no direction; must be x, -x, y, -y, z, -z or three numbers like 0.1,0.9,0"
         )
-    return found / np.linalg.norm(found)
+    return values / np.linalg.norm(values)
 
 
 def per_segment(text: str, segment: str) -> str:
@@ -116,15 +116,15 @@ def mount_of(axis: FloatArray, up: FloatArray | None) -> FloatArray:
 
 def mounts(params: Any, segments: Sequence[str], context: Context | None) -> FloatArray:
     """Return sensor-to-segment rotations (n, 3, 3): by the joint calibration, else by the parameters."""
-    found = np.zeros((len(segments), 3, 3))
+    result = np.zeros((len(segments), 3, 3))
     calibration = context.calibrations.get("joint") if context is not None else None
     for i, segment in enumerate(segments):
         key = f"rot_sb_{segment}"
         if calibration is not None and calibration.usable and key in calibration.values:
-            found[i] = calibration.array(key)
+            result[i] = calibration.array(key)
         else:
-            found[i] = given_mount(params, segment)
-    return found
+            result[i] = given_mount(params, segment)
+    return result
 
 
 def given_mount(params: Any, segment: str) -> FloatArray:
@@ -169,12 +169,12 @@ class JointEstimator(KernelEstimator):
         """Take the segments that are attached, their mountings and calibrations."""
         super().start(context)
         self.context = context
-        known = [i.name for i in self.inputs if i.name != "encoder"]
-        self.segments = tuple(n for n in known if context.has(n)) or tuple(known)
+        roles = [i.name for i in self.inputs if i.name != "encoder"]
+        self.segments = tuple(n for n in roles if context.has(n)) or tuple(roles)
         if len(self.segments) < self.least:
             raise AlgorithmError(
                 f"{self.name}: {len(self.segments)} segment attached ({', '.join(self.segments)}), needs at least "
-                f"{self.least} of {', '.join(known)}; attach one with --input NAME=TOPIC"
+                f"{self.least} of {', '.join(roles)}; attach one with --input NAME=TOPIC"
             )
         self.encoder_columns = context.channels["encoder"][0].columns if context.has("encoder") else ()
         self.state = np.zeros(1, self.dtype)
@@ -237,11 +237,11 @@ class JointEstimator(KernelEstimator):
         """Say which sensors were missing."""
         s = self.state[0]
         total = int(s["samples"])
-        found: list[Remark] = []
+        remarks: list[Remark] = []
         if total == 0:
-            return found
+            return remarks
         if int(s["given"]) == 0 or ("on_line" in (self.dtype.names or ()) and s["on_line"] == 0):
-            found.append(
+            remarks.append(
                 Remark(
                     "no_overlap",
                     f"{', '.join(self.segments)} have no time in common; align their clocks or choose other channels",
@@ -252,11 +252,11 @@ class JointEstimator(KernelEstimator):
         for i, name in streams.items():
             missed = int(s["missed"][i])
             if s["on"][i] and missed > max(2, total // 1000):
-                found.append(
+                remarks.append(
                     Remark(
                         "sensor_missing",
                         f"{name} had no value at {missed} of {total} samples of {self.segments[0]}; "
                         "its angles are left out there",
                     )
                 )
-        return found
+        return remarks

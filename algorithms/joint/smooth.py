@@ -66,10 +66,10 @@ class JointSmooth(ChainEstimator):
     def start(self, context: Context) -> None:
         """Take the joint calibration, and the side of the leg."""
         super().start(context)
-        found = context.calibrations.get("joint")
-        if found is not None and not found.usable:
+        calibration = context.calibrations.get("joint")
+        if calibration is not None and not calibration.usable:
             raise AlgorithmError("the joint calibration says not observable; calibrate on other motion")
-        self._given = found if found is not None and found.values.get("hinges") else None
+        self._given = calibration if calibration is not None and calibration.values.get("hinges") else None
         self._kept: list[tuple[IntArray, IntArray, FloatArray]] = []
         self._found: list[Remark] = []
 
@@ -82,7 +82,7 @@ class JointSmooth(ChainEstimator):
         values: FloatArray,
         *results: Any,
     ) -> int:
-        """Keep the messages."""
+        """Keep the messages: inputs and times (n,), values (n, widest input)."""
         del state, channels, results
         if len(t_ns):
             self._kept.append((inputs.copy(), t_ns.copy(), values.copy()))
@@ -97,19 +97,19 @@ class JointSmooth(ChainEstimator):
             count = tables[few[0]].height if few[0] in tables else 0
             self._found = [Remark("no_data", f"{few[0]}: {count} samples; nothing to smooth", fatal=True)]
             return nothing
-        found = self._given
-        if found is None and self.params.identify != "off":
-            found = self._identified(tables)
-            if not found.usable:
-                self._found = [Remark("not_observable", "; ".join(found.remarks), fatal=True)]
+        calibration = self._given
+        if calibration is None and self.params.identify != "off":
+            calibration = self._identified(tables)
+            if not calibration.usable:
+                self._found = [Remark("not_observable", "; ".join(calibration.remarks), fatal=True)]
                 return nothing
-            sd = found.values["hinges"][0]["axes_sd_deg"]
+            sd = calibration.values["hinges"][0]["axes_sd_deg"]
             self._found = [
                 Remark("axis_found", f"hinge axes of the whole recording ± {sd[0]:.1f}° and {sd[1]:.1f}°")
             ]
-        if found is not None:
+        if calibration is not None:
             self.state[:] = 0
-            self._lay(replace(self.context, calibrations={**self.context.calibrations, "joint": found}))
+            self._lay(replace(self.context, calibrations={**self.context.calibrations, "joint": calibration}))
         return self._smoothed()
 
     def _tables(self) -> Mapping[str, pl.DataFrame]:
@@ -138,11 +138,11 @@ class JointSmooth(ChainEstimator):
                 max_sd_deg=p.max_sd_deg,
             )
         )
-        found = calibrator.calibrate([Stretch({}, {s: (t,) for s, t in tables.items()})])
+        calibration = calibrator.calibrate([Stretch({}, {s: (t,) for s, t in tables.items()})])
         if p.identify == "axes":
-            for hinge in found.values.get("hinges", ()):
+            for hinge in calibration.values.get("hinges", ()):
                 hinge["positions_m"] = np.zeros((2, 3)).tolist()
-        return found
+        return calibration
 
     def _smoothed(self) -> tuple[IntArray, FloatArray]:
         """Return times (n,), angles and standard deviations (n, 2)."""
@@ -157,7 +157,7 @@ class JointSmooth(ChainEstimator):
             message, count = chain_smooth.forward(self.state, which, t_ns, values, logs, message)
             times.append(logs["t_ns"][:count].copy())
             encoder.append(logs["enc"][:count].copy())
-        found: list[FloatArray] = []
+        smoothed: list[FloatArray] = []
         work, after = np.zeros(1, chain_smooth.WORK), np.zeros(1, chain_smooth.LOG)
         end = self.state.copy()
         for state, first in reversed(starts):
@@ -165,12 +165,12 @@ class JointSmooth(ChainEstimator):
             _, count = chain_smooth.forward(self.state, which, t_ns, values, logs, first)
             out = np.zeros((count, 2))
             chain_smooth.backward(self.state, logs, count, after, work, out)
-            found.insert(0, out)
+            smoothed.insert(0, out)
         self.state[:] = end
-        at, angles = np.concatenate(times), np.concatenate(found)
-        if len(at):
-            self._settle(at, angles, np.concatenate(encoder))
-        return at, angles
+        when, angles = np.concatenate(times), np.concatenate(smoothed)
+        if len(when):
+            self._settle(when, angles, np.concatenate(encoder))
+        return when, angles
 
     def _settle(self, t_ns: IntArray, angles: FloatArray, encoder: FloatArray) -> None:
         """Take out whole turns and the zero, in place; put the zero's uncertainty into the standard deviation."""
@@ -203,5 +203,5 @@ class JointSmooth(ChainEstimator):
         if any(r.fatal for r in self._found):
             return self._found
         s = self.state[0]
-        found = self._found + (mounting_remarks(s, self.segments) if self._found else [])
-        return super().remarks() + (found or axis_remarks(s, self.segments, fatal=False))
+        remarks = self._found + (mounting_remarks(s, self.segments) if self._found else [])
+        return super().remarks() + (remarks or axis_remarks(s, self.segments, fatal=False))
