@@ -23,6 +23,7 @@ from marcha.recording import MarchaError, UsageError
 from marcha.viz import domain_figures
 from marcha.viz.figures import figure
 
+from .c3d_files import write_c3d
 from .cli_helpers import marcha
 from .contracts.exporter import example
 from .fuzz import mcap
@@ -325,3 +326,15 @@ def test_an_anchor_table_with_returns_inside_is_read_by_lines() -> None:
     table = b"name,mac,x_m,y_m\na,00:00:00:00:00:01,0,0\rb,00:00:00:00:00:02,1,1\n"
     found = addresses([SourceAttachment("anchors.csv", table, "text/csv")])
     assert found == ["00:00:00:00:00:01", "00:00:00:00:00:02"]
+
+
+def test_a_marker_whose_name_is_no_utf8_is_read(tmp_path: Path) -> None:
+    pytest.importorskip("ezc3d")
+    pos = np.arange(60.0).reshape(20, 1, 3)
+    write_c3d(tmp_path / "a.c3d", pos, np.zeros((20, 1)), processor="intel", integers=False)
+    data = (tmp_path / "a.c3d").read_bytes()
+    assert data.count(b"m1") == 1
+    (tmp_path / "a.c3d").write_bytes(data.replace(b"m1", b"m\xff"))
+    convert(tmp_path / "a.c3d", tmp_path / "out.mcap")
+    with mr.open(tmp_path / "out.mcap") as rec:
+        assert rec.channels["/reference/markers"].columns == ("m?.x", "m?.y", "m?.z")

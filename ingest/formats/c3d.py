@@ -222,7 +222,8 @@ def _read(path: Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
             else f"its reader ended with signal {-done.returncode}"
         )
         raise MarchaError(f"{path}: a damaged C3D file ({why}); export it again")
-    facts = json.loads(head)
+    # Names of markers are in whatever encoding the system had; other bytes than UTF-8 become a question mark.
+    facts = json.loads(json.dumps(json.loads(head), ensure_ascii=False).encode("utf-8", "replace"))
     size = int(np.prod(facts["shape"]))
     numbers = np.frombuffer(data, "<f8")
     pos = numbers[:size].reshape(facts["shape"]).astype(float)
