@@ -175,7 +175,7 @@ class _Merged:
         self._several = count > 1
         self._facts = facts
         self._floor = floor
-        self._reports: list[tuple[str, Report]] = []
+        self._reports: list[tuple[list[str], Report]] = []
         self._records: dict[str, dict[str, str]] = {"plan": floor.metadata} if floor.metadata else {}
         self._clocks: dict[str, str] = {}
         self.attachments: list[SourceAttachment] = list(floor.attachments)
@@ -203,7 +203,8 @@ class _Merged:
                 radio.feed(topic, table)
                 written.add(topic, table)
         anchors = [*self._floor.anchors, *addresses(imported.attachments)]
-        self._reports.append((name, radio.finish(watch.finish(imported.report), anchors)))
+        files = [as_unicode(p.name) for p in source.files]
+        self._reports.append((files, radio.finish(watch.finish(imported.report), anchors)))
         specs = [*imported.channels, *(spec for spec, _ in truth.tables)] if truth else imported.channels
         for spec, table in truth.tables if truth else ():
             written.declare(spec)
@@ -219,7 +220,7 @@ class _Merged:
         self.attachments += [a for a in (*imported.attachments, *raw) if a.name not in names]
 
     def report(self, floor: Report) -> Report:
-        """Return the report of all sources; of several a finding names its file. ``floor`` is that of the plan."""
+        """Return the report of all sources; of several a finding names its files. ``floor`` is that of the plan."""
         if not self._several:
             return _beside(self._reports[0][1], floor)
         counts = {
@@ -227,8 +228,10 @@ class _Merged:
             for key in ("rows_read", "rows_kept", "rows_repaired", "rows_dropped")
         }
         findings = [
-            f if name in f.detail else msgspec.structs.replace(f, detail=f"{name}: {f.detail}")
-            for name, r in self._reports
+            f
+            if any(name in f.detail for name in files)
+            else msgspec.structs.replace(f, detail=f"{' + '.join(files[:4])}: {f.detail}")
+            for files, r in self._reports
             for f in r.findings
         ]
         whole = Report(**counts, findings=findings, lossy=any(r.lossy for _, r in self._reports))

@@ -209,6 +209,8 @@ def _swapped(sensors: Mapping[str, _Sensor], report: ReportBuilder) -> None:
         if "thigh" not in topic or other not in sensors:
             continue
         lower = sensors[other]
+        if min(upper.rate, lower.rate) < STILL_RATE:  # a fixed link, or a dead sensor: said by _still
+            continue
         posture = {name: s.turn(1.5) for name, s in ((topic, upper), (other, lower))}
         if max(posture.values()) > POSTURE_RAD:
             swapped = posture[other] > SWAP_RATIO * posture[topic] > SWAP_RATIO * np.radians(8.0)

@@ -16,6 +16,7 @@ import polars as pl
 
 from ..algorithms.contract import FloatArray
 from .alignment import IntArray
+from .references import reference_of
 from .trajectory import inside
 
 if TYPE_CHECKING:
@@ -378,14 +379,33 @@ def doubts(view: RunView) -> list[str]:
                     f"{name}: the reference has {there}; convert it with --set side=left (or right)"
                 )
     beside = angles_beside(view)
+    result += _clocks(view)
     result += _coverage(ours, truth, sum(t_ns.size for _, t_ns, _, _ in beside))
     for name, t_ns, estimate, reference in beside:
         if t_ns.size > 100 and pearson_r(estimate, reference) < -0.5:
             result.append(
-                f"{name}: turns against its reference (r {pearson_r(estimate, reference):.2f}): reverse the flexion "
-                "axis (-p axis=-x), or check which sensor is on which segment"
+                f"{name}: turns against its reference (r {pearson_r(estimate, reference):.2f}): reverse the sign of "
+                "axis (-p axis=-x instead of x), or check which sensor is on which segment"
             )
     return result
+
+
+def _clocks(view: RunView) -> list[str]:
+    """Say where the joints' reference runs on another clock than the run's sensors."""
+    if view.recording is None:
+        return []
+    clocks = view.recording.metadata.get("clocks", {})
+    topic = view.lineage.get("input", "")
+    reference = reference_of(
+        view.recording.channels, "joint", topic, view.chosen_reference, str(view.recording.path)
+    )
+    own, other = clocks.get(topic, ""), clocks.get(reference or "", "")
+    if not own or not other or own == other:
+        return []
+    return [
+        f"the reference's clock ({other}) is not that of the sensors ({own}): errors "
+        "hold only where both began together; align them first (marcha align)"
+    ]
 
 
 def _coverage(ours: pl.DataFrame, truth: pl.DataFrame, compared: int) -> list[str]:

@@ -10,6 +10,7 @@ import polars as pl
 import pytest
 import scipy.io
 from marcha.ingest.formats.c3d import C3d
+from marcha.ingest.formats.inertial_csv import InertialCsv
 from marcha.ingest.formats.mpu_encoder_mat import MpuEncoderMat
 from marcha.ingest.formats.repoimu_csv import FIRST, SECOND, RepoImuCsv
 from marcha.ingest.formats.vicon_csv import ViconCsv
@@ -32,6 +33,29 @@ def markers(capture: LegCapture) -> np.ndarray:
     """Return the leg's landmarks (n, 7, 3), m."""
     names = list(capture.optical.names)
     return capture.optical.pos[:, [names.index(m) for m in MARKS]]
+
+
+def sensor_csv(path: Path, capture: LegCapture, segment: str, header: str) -> Path:
+    """Write a sensor as a logger does: ms, g and °/s; between semicolons with decimal commas."""
+    one = capture.segments[segment]
+    cells = np.column_stack([capture.t * 1e3, one.acc_b / 9.80665, np.degrees(one.gyr_b)])
+    rows = "\n".join(
+        (";" if ";" in header else ",").join(
+            f"{v:.5f}".replace(".", "," if ";" in header else ".") for v in row
+        )
+        for row in cells
+    )
+    path.write_text(f"{header}\n{rows}\n", encoding="utf-8")
+    return path
+
+
+class TestInertialCsv(ImporterContract):
+    importer = InertialCsv()
+
+    def sample(self, folder: Path) -> Path:
+        return sensor_csv(
+            folder / "thigh.csv", squats(), "thigh", "time_ms,ax_g,ay_g,az_g,gx_dps,gy_dps,gz_dps"
+        )
 
 
 class TestViconCsv(ImporterContract):

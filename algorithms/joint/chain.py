@@ -141,7 +141,9 @@ def restart(s: Any, i: int) -> None:
     n = 6 * s.n
     a = s.acc[i]
     size = math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
-    ux, uy, uz = a[0] / size, a[1] / size, a[2] / size
+    ux, uy, uz = s.mount[i, 2, 0], s.mount[i, 2, 1], s.mount[i, 2, 2]
+    if size > 1e-3:  # a dead sensor feels no force
+        ux, uy, uz = a[0] / size, a[1] / size, a[2] / size
     jx, jy, jz = s.mount[i, 0, 0], s.mount[i, 0, 1], s.mount[i, 0, 2]
     dot = ux * jx + uy * jy + uz * jz
     level = abs(dot) < 0.9

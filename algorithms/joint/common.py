@@ -234,7 +234,7 @@ class JointEstimator(KernelEstimator):
         return self.state.copy()
 
     def remarks(self) -> list[Remark]:
-        """Say which sensors were missing."""
+        """Say which sensors were missing or dead."""
         s = self.state[0]
         total = int(s["samples"])
         remarks: list[Remark] = []
@@ -248,6 +248,16 @@ class JointEstimator(KernelEstimator):
                     fatal=True,
                 )
             )
+        for i, name in enumerate(self.segments):
+            if s["dead"][i] > 0.1 * total:
+                remarks.append(
+                    Remark(
+                        "sensor_dead",
+                        f"{name}: {int(s['dead'][i])} of {total} samples are exactly 0, gravity too: is the sensor "
+                        "connected?",
+                        fatal=True,
+                    )
+                )
         streams: Mapping[int, str] = {**dict(enumerate(self.segments)), ENCODER: "encoder"}
         for i, name in streams.items():
             missed = int(s["missed"][i])

@@ -49,6 +49,7 @@ FIELDS: list[Any] = [
     ("sum", "f8", (MOST, 3)),
     ("seen", "i8", (MOST,)),  # time of the last valid sample of each segment
     ("missed", "i8", (STREAMS,)),
+    ("dead", "i8", (MOST,)),  # samples in which acceleration and rate are exactly 0
     ("samples", "i8"),
     ("given", "i8"),
     ("line_t", "i8", (LINE,)),
@@ -185,6 +186,12 @@ def give(s: Any) -> bool:
         s.valid[i] = s.line_valid[a, i]
         s.gap[i] = s.line_gap[a, i]
         s.slope[i] = 1 if whole else 0
+        force, rate = 0.0, 0.0
+        for j in range(3):
+            force += abs(s.line_acc[a, i, j])
+            rate += abs(s.line_gyr[a, i, j])
+        if s.valid[i] == 1 and force == 0.0 and rate == 0.0:
+            s.dead[i] += 1
         if whole:
             for m in range(first, last + 1):
                 if s.line_valid[m % LINE, i] == 0:

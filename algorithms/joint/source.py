@@ -442,6 +442,11 @@ def axis_remarks(s: Any, segments: tuple[str, ...], fatal: bool = True) -> list[
         else f"both turn as one body (relative turn {s['turn_rms']:.2f} rad/s)"
         if s["turn_rms"] <= 0.1
         else f"sd {sd[0]:.1f}° and {sd[1]:.1f}°, pairing {s['pairing']:.2f} of at least 0.55"
+        + (
+            " (each axis is plain, their signs are not: one sensor mirrored, or axis near the vertical?)"
+            if max(sd) < 3.0
+            else ""
+        )
     )
     return [
         Remark(

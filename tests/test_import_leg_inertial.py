@@ -1,0 +1,108 @@
+"""Sensors of any logger: headers in English and Portuguese, units, what is wrong, the knee beside its markers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import marcha.recording as mr
+import pytest
+from marcha.ingest import convert
+from marcha.recording import MarchaError
+
+from .cli_helpers import marcha
+from .leg_files import xsens_and_markers
+from .test_import_leg_contracts import sensor_csv, squats
+
+ENGLISH = "time_ms,ax_g,ay_g,az_g,gx_dps,gy_dps,gz_dps"
+PORTUGUESE = "Tempo (ms);" + ";".join(
+    f"{w} {a} ({u})" for w, u in (("Aceleração", "g"), ("Velocidade angular", "graus/s")) for a in "XYZ"
+)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        ENGLISH,
+        PORTUGUESE,
+        "Timestamp [ms],AccX [g],AccY [g],AccZ [g],GyroX [°/s],GyroY [°/s],GyroZ [°/s]",
+        "t_ms,accel_x_g,accel_y_g,accel_z_g,gyr_x_dps,gyr_y_dps,gyr_z_dps",
+    ],
+)
+def test_headers_of_loggers(tmp_path: Path, header: str) -> None:
+    """Words, separators and decimal signs vary; what comes out is the sensor's, in SI."""
+    capture = squats()
+    convert(sensor_csv(tmp_path / "thigh.csv", capture, "thigh", header), tmp_path / "a.mcap")
+    table = mr.open(tmp_path / "a.mcap").table("/leg/thigh/imu")
+    assert table["t_ns"].to_numpy() == pytest.approx(capture.t * 1e9, abs=2e4)
+    one = capture.segments["thigh"]
+    for kind, values in (("acc", one.acc_b), ("gyr", one.gyr_b)):
+        got = table.select(f"{kind}_{a}" for a in "xyz").to_numpy()
+        assert got == pytest.approx(values, abs=1e-4)
+
+
+def test_units_are_said_or_refused(tmp_path: Path) -> None:
+    """Without units one line names every missing one and how to say it; said, it converts."""
+    path = sensor_csv(tmp_path / "thigh.csv", squats(), "thigh", "time,AccX,AccY,AccZ,GyrX,GyrY,GyrZ")
+    with pytest.raises(
+        MarchaError, match=r"'time', 'AccX', 'GyrX'.*time_unit=ms.*acc_unit=g.*gyr_unit=deg/s"
+    ):
+        convert(path, tmp_path / "a.mcap")
+    units = {"time_unit": "ms", "acc_unit": "g", "gyr_unit": "deg/s"}
+    assert convert(path, tmp_path / "a.mcap", options=units).report.rows_kept == 500
+    with pytest.raises(MarchaError, match=r"column 'GyrX': unit 'm/s' cannot become rad/s"):
+        convert(path, tmp_path / "b.mcap", options=units | {"gyr_unit": "m/s"})
+
+
+def test_two_sensors_and_markers_give_a_judged_knee_in_three_commands(tmp_path: Path) -> None:
+    """Two loggers' files in Portuguese beside a TRC of another clock, up to the error per cycle."""
+    capture = xsens_and_markers(tmp_path)
+    for segment, name in (("thigh", "coxa"), ("shank", "perna")):
+        sensor_csv(tmp_path / f"{name}.csv", capture, segment, PORTUGUESE)
+    files = [tmp_path / n for n in ("coxa.csv", "perna.csv", "walk.trc")]
+    raw, one, knee = (tmp_path / f"{n}.mcap" for n in ("raw", "one", "knee"))
+    assert marcha("convert", *files, "--set", "segments=thigh,shank", "-o", raw).code == 0
+    early = tmp_path / "early.mcap"
+    assert marcha("replay", raw, "-e", "joint.hinge", "-o", early).code == 0
+    assert "align them first (marcha align)" in marcha("evaluate", early).out
+    assert marcha("align", raw, "-o", one).code == 0
+    ran = marcha("replay", one, "-e", "joint.hinge", "-o", knee, "--json")
+    assert ran.code == 0
+    metrics = ran.document["runs"][0]["metrics"]
+    assert metrics["cycles.knee"] >= 25
+    assert metrics["rmse_unbiased_deg.knee"] < 1.0
+    assert metrics["cycle_rmse_deg.knee"] < 4.0  # the mounting's share is in it
+
+
+def test_a_silent_stretch_does_not_keep_the_clocks_apart(tmp_path: Path) -> None:
+    """The shank's sensor misses 8 s: the clocks are found from the rest."""
+    capture = xsens_and_markers(tmp_path)
+    for segment in ("thigh", "shank"):
+        sensor_csv(tmp_path / f"{segment}.csv", capture, segment, ENGLISH)
+    lines = (tmp_path / "shank.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "shank.csv").write_text("".join(lines[:1500] + lines[2300:]))
+    files = [tmp_path / n for n in ("thigh.csv", "shank.csv", "walk.trc")]
+    assert marcha("convert", *files, "-o", tmp_path / "raw.mcap").code == 3  # sensor_gap
+    ran = marcha("align", tmp_path / "raw.mcap", "-o", tmp_path / "one.mcap", "--json")
+    assert ran.code == 0
+    assert ran.document["offset_s"] == pytest.approx(1.3, abs=0.003)
+
+
+@pytest.mark.parametrize("estimator", ["joint.hinge", "joint.relative", "joint.global"])
+def test_a_dead_sensor_is_said_and_never_crashes(tmp_path: Path, estimator: str) -> None:
+    """Every reading of the shank is 0: import and estimator say so, and the result must not be used."""
+    capture = squats()
+    for segment in ("thigh", "shank"):
+        sensor_csv(tmp_path / f"{segment}.csv", capture, segment, ENGLISH)
+    lines = (tmp_path / "shank.csv").read_text().splitlines()
+    dead = [f"{line.split(',')[0]},0,0,0,0,0,0" for line in lines[1:]]
+    (tmp_path / "shank.csv").write_text("\n".join([lines[0], *dead, ""]))
+    ran = marcha(
+        "convert", tmp_path / "thigh.csv", tmp_path / "shank.csv", "-o", tmp_path / "raw.mcap", "--json"
+    )
+    kinds = {f["kind"] for f in ran.document["report"]["findings"]}
+    assert ran.code == 3
+    assert {"all_zero", "still_sensor"} <= kinds
+    assert "swapped" not in kinds
+    ran = marcha("replay", tmp_path / "raw.mcap", "-e", estimator, "-o", tmp_path / "k.mcap", "--json")
+    assert ran.code == 3
+    assert "sensor_dead" in {f["kind"] for f in ran.document["runs"][0]["findings"]}
