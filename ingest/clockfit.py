@@ -193,7 +193,7 @@ def _refine(sides: Sequence[_Even], offset: float, band_hz: float) -> _Fit:
         for s in sides:
             shifted = s.tb + offset + drift * (s.tb - middle)
             inside = np.isfinite(s.b).all(axis=1) & (shifted > s.ta[20]) & (shifted < s.ta[-20])
-            inside &= np.interp(shifted, s.ta, _known(s.a)) == 1.0
+            inside &= np.interp(shifted, s.ta, _measured(s.a)) == 1.0
             if inside.sum() < LEAST_S * RATE_HZ:
                 raise MarchaError(
                     f"alignment: the two overlap by less than {LEAST_S:g} s: no common motion in time"
@@ -223,14 +223,14 @@ def _refine(sides: Sequence[_Even], offset: float, band_hz: float) -> _Fit:
     return _Fit(float(offset), float(drift), middle, float(sd[0]), float(sd[1]), r, overlap)
 
 
-def _known(values: FloatArray) -> FloatArray:
+def _measured(values: FloatArray) -> FloatArray:
     """Return 1 where the row and its 20 neighbours on both sides are numbers, else 0 (n,)."""
     lost = ~np.isfinite(values).all(axis=1)
     return np.where(np.convolve(lost, np.ones(41), "same") > 0.5, 0.0, 1.0)
 
 
 def _interpolated(t: FloatArray, own: FloatArray, values: FloatArray) -> FloatArray:
-    """Return the spline through ``values`` at ``t``; what is missing counts as 0 (see :func:`_known`)."""
+    """Return the spline through ``values`` at ``t``; what is missing counts as 0 (see :func:`_measured`)."""
     from scipy.interpolate import make_interp_spline
 
     return make_interp_spline(own, np.nan_to_num(values), k=3)(t)

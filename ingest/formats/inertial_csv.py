@@ -148,7 +148,7 @@ def _plans(segment: str, columns: dict[str, SourceColumn]) -> list[ChannelColumn
 
 @lru_cache(maxsize=1024)
 def _meaning(name: str) -> _Meaning | None:
-    """Return quantity, axis ('' of time) and unit ('' where it is not said) of a column; None of any other."""
+    """Return quantity, axis ('' of time) and unit (where it is not said) of a column; None of any other."""
     bracket = _BRACKETS.search(name)
     unit = bracket[1].strip() if bracket else ""
     bare = unicodedata.normalize("NFKD", _BRACKETS.sub(" ", name)).encode("ascii", "ignore").decode()
@@ -166,8 +166,8 @@ def _meaning(name: str) -> _Meaning | None:
 
 
 def _is_header(cells: Sequence[str]) -> bool:
-    found = [f"{m.quantity}_{m.axis}" for c in cells if (m := _meaning(c))]
-    return len(set(found)) == len(found) and {"t_", *ACC, *GYR} <= set(found)
+    named = [f"{m.quantity}_{m.axis}" for c in cells if (m := _meaning(c))]
+    return len(set(named)) == len(named) and {"t_", *ACC, *GYR} <= set(named)
 
 
 def _columns(path: Path, header: Header, options: InertialCsvOptions) -> dict[str, SourceColumn]:
@@ -176,9 +176,14 @@ def _columns(path: Path, header: Header, options: InertialCsvOptions) -> dict[st
     Raises
     ------
     MarchaError
-        A unit is unknown, or is neither in the header nor said.
+        A unit is unknown, or is neither in the header nor stated.
     """
-    said = {"t": options.time_unit, "acc": options.acc_unit, "gyr": options.gyr_unit, "mag": options.mag_unit}
+    stated = {
+        "t": options.time_unit,
+        "acc": options.acc_unit,
+        "gyr": options.gyr_unit,
+        "mag": options.mag_unit,
+    }
     usual = {"t": "time_unit=ms", "acc": "acc_unit=g", "gyr": "gyr_unit=deg/s", "mag": "mag_unit=uT"}
     columns: dict[str, SourceColumn] = {}
     silent: dict[str, str] = {}
@@ -187,7 +192,7 @@ def _columns(path: Path, header: Header, options: InertialCsvOptions) -> dict[st
         if meaning is None:
             continue
         quantity = meaning.quantity
-        unit = meaning.unit or said[quantity]
+        unit = meaning.unit or stated[quantity]
         if unit is None:
             silent.setdefault(quantity, name)
             continue
