@@ -238,6 +238,26 @@ def test_gnsslogger_takes_one_provider_and_the_exact_clock(tmp_path: Path, walk:
     assert np.degrees(np.arctan2(top[0], top[1])) % 360 == pytest.approx(201.0)
 
 
+@pytest.mark.parametrize("stamp", ["1e308", "-9e18", "inf", ""])
+def test_gnsslogger_a_bad_time_since_boot_is_missing_and_counted(
+    tmp_path: Path, walk: PhoneWalk, stamp: str
+) -> None:
+    """The row keeps its place by UTC, and all others keep the exact clock."""
+    path = samples.gnsslogger_v3(tmp_path / "gnss_log_2026_03_09.txt", walk)
+    lines = path.read_text().split("\n")
+    bad = [i for i, line in enumerate(lines) if line.startswith("UncalGyro")][20]
+    cells = lines[bad].split(",")
+    lines[bad] = ",".join([*cells[:2], stamp, *cells[3:]])
+    path.write_text("\n".join(lines))
+    _, tables, report = read(GnssLogger(), path)
+    assert report.rows_dropped == kinds(report)["other_provider"]
+    assert [(f.count, f.first_line) for f in report.findings if f.kind == "missing_cell"] == [(1, bad + 1)]
+    wrong = tables["/phone/gyr"]["t_ns"].to_numpy() - walk.t_ns
+    wrong -= wrong[0]
+    assert np.flatnonzero(wrong).tolist() in ([20], [])
+    assert np.abs(wrong).max() < 1_000_000
+
+
 @pytest.mark.parametrize(("platform", "inverse"), [("android", False), ("ios", False), ("ios", True)])
 def test_sensor_logger_keeps_the_phones_own_orientation(
     tmp_path: Path, walk: PhoneWalk, platform: str, inverse: bool

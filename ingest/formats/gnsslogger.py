@@ -38,6 +38,7 @@ from ..phonelog import (
     xyz,
 )
 from ..text import read_blocks, start_of
+from ..timestamps import MOST_NS
 from ..typedrows import typed_blocks
 
 _SENSORS = {"Accel": "/phone/acc", "Gyro": "/phone/gyr", "Mag": "/phone/mag"}
@@ -173,22 +174,38 @@ def _sensor_column(name: str) -> str:
     return (("bias_" if bias else "") + match[1]) if match else ""
 
 
-def _utc_ns(frame: pl.DataFrame, boot_ns: list[int]) -> pl.Series:
-    """Return the rows' times (ns): since boot moved to UTC where both are there and run alike, else UTC.
+def _utc_ns(frame: pl.DataFrame, boot_ns: list[int], report: ReportBuilder) -> pl.Series:
+    """Return the rows' times (ns): since boot moved to UTC where both run alike, else UTC.
 
-    ``boot_ns`` keeps the UTC of boot, found in the first block that has both, for all kinds of rows.
+    A row whose time since boot is missing, or is none that a clock can say, has its UTC alone. ``boot_ns`` keeps the
+    UTC of boot, found in the first block that has both, for all kinds of rows.
     """
     utc = whole_ns(frame["t"], 1e3)
-    if "boot" not in frame.columns or not frame["boot"].is_finite().all():
+    if "boot" not in frame.columns:
         return utc
-    since = frame["boot"].round().cast(pl.Int64)
-    gap = utc - since
+    boot = frame["boot"]
+    known = boot.is_finite() & (boot.abs() <= MOST_NS)
+    far = boot.is_infinite() | (boot.abs() > MOST_NS)
+    if far.any():
+        first = int(far.arg_true()[0])
+        report.repair(
+            "missing_cell",
+            f"elapsedRealtimeNanos: {boot[first]:g} is beyond any clock: taken as missing",
+            count=int(far.sum()),
+            line=frame["line"][first],
+            subject="boot",
+        )
+    if not known.any():
+        return utc
+    since = pl.select(pl.when(known).then(boot)).to_series().round().cast(pl.Int64)
+    gap = (utc - since).drop_nulls()
     middle = int(np.median(gap.to_numpy()))
     if int(gap.max()) - int(gap.min()) > _SAME_CLOCK_NS:  # type: ignore[arg-type]
         return utc
     if not boot_ns:
         boot_ns.append(middle)
-    return since + (boot_ns[0] if abs(middle - boot_ns[0]) < _SAME_CLOCK_NS else middle)
+    offset = boot_ns[0] if abs(middle - boot_ns[0]) < _SAME_CLOCK_NS else middle
+    return (since + offset).fill_null(utc)
 
 
 def _blocks(
@@ -212,7 +229,7 @@ def _blocks(
     )
     for block in tables:
         for kind, frame in block.items():
-            frame = frame.with_columns(t=_utc_ns(frame, boot_ns))
+            frame = frame.with_columns(t=_utc_ns(frame, boot_ns, report))
             if kind == "Fix" and "provider" in frame.columns:
                 gps = frame["provider"].str.to_uppercase() == provider
                 if not gps.all():
