@@ -7,6 +7,7 @@ Channels are found by message type and columns, never by the name of a run.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +27,7 @@ from .shapes import ELLIPSE95, circle, geo_circle, metres_a_degree
 from .stance_figures import conditions
 from .stride_figures import strides
 from .text import printable
+from .thinned import acc_norm, every, pieces, thinned
 from .trace import Trace, compared, distance
 from .views.base import role_of
 from .views.joint import difference
@@ -91,6 +93,11 @@ def _rows(fig: Figure, count: int) -> list[Axes]:
     return list(fig.subplots(count, 1, squeeze=False)[:, 0])
 
 
+def _with_norm(table: pl.DataFrame, names: Sequence[str]) -> Floats:
+    values = table.select(names).to_numpy()
+    return np.column_stack((values, np.linalg.norm(values, axis=1)))
+
+
 def signals(rec: Recording, fig: Figure) -> None:
     """Accelerometer and gyroscope of every sensor by axis, with the norm."""
     panels = [
@@ -100,11 +107,12 @@ def signals(rec: Recording, fig: Figure) -> None:
     ]
     _require(rec, "inertial sensor", [t for t, *_ in panels])
     for ax, (topic, key, unit) in zip(_rows(fig, len(panels)), panels, strict=True):
-        table = rec.table(topic)
-        values, t = table.select(f"{key}_{a}" for a in "xyz").to_numpy(), _s(rec, table)
+        names = [f"{key}_{a}" for a in "xyz"]
+        t_ns, values = thinned(rec, topic, partial(_with_norm, names=names))
+        t = (t_ns - (rec.start_ns or 0)) / 1e9
         for i, a in enumerate("xyz"):
             ax.plot(t, values[:, i], color=style.AXES[i], linewidth=0.8, label=a)
-        ax.plot(t, np.linalg.norm(values, axis=1), color=style.NORM, linewidth=0.8, label="norm")
+        ax.plot(t, values[:, 3], color=style.NORM, linewidth=0.8, label="norm")
         _dress(ax, f"{printable(topic)} {key}", TIME, unit)
 
 
@@ -115,15 +123,16 @@ def steps(rec: Recording, fig: Figure) -> None:
     sensors = _topics(rec, ["acc_x"], "sensor_msgs/msg/Imu", role="raw")
     norm: tuple[Floats, Floats] | None = None
     if sensors:
-        table = rec.table(sensors[0])
-        norm = _s(rec, table), np.linalg.norm(table.select("acc_x", "acc_y", "acc_z").to_numpy(), axis=1)
+        t_ns, values = thinned(rec, sensors[0], acc_norm)
+        norm = (t_ns - (rec.start_ns or 0)) / 1e9, values[:, 0]
         top.plot(*norm, color=style.NORM, linewidth=0.7, label=f"‖acc‖ of {printable(sensors[0])}")
     for topic in topics:
         table, color = rec.table(topic), _color(rec, topic)
         t, length = _s(rec, table), table["length_m"].to_numpy()
         height = np.interp(t, *norm) if norm else np.ones(len(t))
         top.plot(t, height, "d", color=color, markersize=4, label=f"{_owner(topic)}: {len(t)} steps")
-        lengths.bar(np.arange(1, len(t) + 1), length, color=color, alpha=0.7, label=_owner(topic))
+        edges = np.arange(len(t) + 1) + 0.5
+        lengths.stairs(length, edges, fill=True, color=color, alpha=0.7, label=_owner(topic))
         way.step(np.arange(1, len(t) + 1), np.nancumsum(length), color=color, label=_owner(topic))
     _dress(top, "steps along the norm", TIME, "m/s²")
     lengths.set_ylim(top=1.3 * lengths.get_ylim()[1])  # room for the legend
@@ -190,11 +199,11 @@ def fixes(rec: Recording, fig: Figure) -> None:
 def _traces(rec: Recording) -> dict[str, Trace]:
     traces: dict[str, Trace] = {}
     for topic in _topics(rec, ["pos_x", "pos_y", "pos_z"], *PLACES):
-        table = rec.table(topic)
-        position = table.select(pl.col("pos_x", "pos_y"), pl.col("pos_z").fill_nan(0.0)).to_numpy()
-        turn = table.select(f"quat_{a}" for a in "wxyz").to_numpy() if "quat_w" in table.columns else None
         trace = Trace(_owner(topic), _color(rec, topic))
-        trace.add(table["t_ns"].to_numpy(), position, turn)
+        for table in pieces(rec, topic):
+            position = table.select(pl.col("pos_x", "pos_y"), pl.col("pos_z").fill_nan(0.0)).to_numpy()
+            turn = table.select(f"quat_{a}" for a in "wxyz").to_numpy() if "quat_w" in table.columns else None
+            trace.add(table["t_ns"].to_numpy(), position, turn)
         if trace.count:
             traces[topic] = trace
     return traces
@@ -222,8 +231,7 @@ def floor(rec: Recording, fig: Figure) -> None:
         ax.plot(p[:, 0], p[:, 1], color=trace.color, marker=mark, markersize=3, label=trace.owner)
         stated = f"{topic.rpartition('/')[0]}/sigma"
         if is_estimate(topic) and {"sigma_pos_x", "sigma_pos_y"} <= set(_columns(rec, stated)):
-            table = rec.table(stated)
-            kept = table[:: max(1, table.height // MOST_ELLIPSES)]
+            kept = every(rec, stated, MOST_ELLIPSES)
             axes = ELLIPSE95 * kept.select("sigma_pos_x", "sigma_pos_y").to_numpy()
             for ring in circle(trace.at(kept["t_ns"].to_numpy()), axes):
                 ax.plot(ring[:, 0], ring[:, 1], color=trace.color, linewidth=0.5, alpha=0.5)

@@ -12,15 +12,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from ..recording import Recording
 from ..recording.atomic import AtomicFile
 from ..recording.errors import MarchaError, UsageError
 from ..replay.references import shown_reference
+from ..replay.trajectory import stances_of
 from ..replay.view import Comparison
 from . import style
 from .text import printable
+from .thinned import acc_norm, pieces, thinned
 from .trace import Trace, compared, distance, framed
 
 if TYPE_CHECKING:
@@ -326,9 +329,8 @@ def _signals(ax: Axes, walk: _Walk) -> None:
     read = [t for t in imus if any(t.strip("/").replace("/", "_") in run for run in runs)]
     drawn, high = (read or imus)[: 1 if runs else None], 0.0
     for i, topic in enumerate(drawn):
-        table = rec.table(topic)
-        acc = table.select("acc_x", "acc_y", "acc_z").to_numpy()
-        t, norm = _thin(walk.seconds(table["t_ns"].to_numpy()), np.linalg.norm(acc, axis=1))
+        t_ns, values = thinned(rec, topic, acc_norm, POINTS)
+        t, norm = walk.seconds(t_ns), values[:, 0]
         ax.plot(t, norm, color=style.NORM if runs else style.run_color(i), linewidth=0.8, label=topic)
         high = max(high, float(np.nanmax(norm, initial=0.0)))
     lanes = [(f"{t.rpartition('/')[0]}/stance", style.REFERENCE) for t in walk.references]
@@ -350,12 +352,15 @@ def _signals(ax: Axes, walk: _Walk) -> None:
 
 def _stances(walk: _Walk, topic: str) -> list[tuple[float, float]]:
     """Return the stances of a channel as (start, duration), s."""
-    table = walk.rec.table(topic)
-    still = table["still"].cast(bool).to_numpy().astype(np.int8)
-    edges = np.diff(still, prepend=np.int8(0), append=np.int8(0))
-    t = walk.seconds(table["t_ns"].to_numpy())
-    first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
-    return [(float(t[a]), float(t[b] - t[a])) for a, b in zip(first, last, strict=True)]
+    spans = stances_of(pieces(walk.rec, topic))
+    starts, ends = walk.seconds(spans[:, 0]), walk.seconds(spans[:, 1])
+    return list(zip(starts.tolist(), (ends - starts).tolist(), strict=True))
+
+
+def _sigma(table: pl.DataFrame) -> Floats:
+    axes = table.select(POSITION_SIGMA).to_numpy()  # a phone says nothing of the height: NaN
+    stated = np.isfinite(axes).any(axis=1)
+    return np.where(stated, np.sqrt(np.nansum(axes**2, axis=1)), np.nan)[:, None]
 
 
 def _errors(ax: Axes, walk: _Walk) -> None:
@@ -369,11 +374,9 @@ def _errors(ax: Axes, walk: _Walk) -> None:
             ax.plot(t, d, color=track.color, linewidth=1.2)
             top = max(top, float(far.max())) if track in inside else top
         if topic := _position_sigma(walk.rec, run):
-            table = walk.rec.table(topic)
-            axes = table.select(POSITION_SIGMA).to_numpy()  # a phone says nothing of the height: NaN
-            sigma = np.where(np.isfinite(axes).any(axis=1), np.sqrt(np.nansum(axes**2, axis=1)), np.nan)
-            t, s = _thin(walk.seconds(table["t_ns"].to_numpy()), sigma)
-            ax.fill_between(t, 0.0, s, color=track.color, alpha=0.2, linewidth=0)
+            t_ns, values = thinned(walk.rec, topic, _sigma, POINTS)
+            t, sigma = walk.seconds(t_ns), values[:, 0]
+            ax.fill_between(t, 0.0, sigma, color=track.color, alpha=0.2, linewidth=0)
             top = max(top, float(np.nanmax(sigma, initial=0.0))) if track in inside else top
     ax.set_ylim(0.0, 1.1 * top if top > 0.0 else 1.0)
     title = "distance to the reference (area: the filter's own 1σ)"

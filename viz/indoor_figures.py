@@ -17,6 +17,7 @@ from .floor import plan_of
 from .plan_figures import draw_floor, true_positions
 from .shapes import circle
 from .text import printable
+from .thinned import first_rows
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -209,7 +210,7 @@ def threshold(rec: Recording, fig: Figure) -> None:
     )
     if acc is None:
         raise UsageError(f"{rec.path}: nothing for this figure: no accelerometer")
-    table = rec.table(acc)
+    table, whole = first_rows(rec, acc)
     t_ns = table["t_ns"].to_numpy()
     t, values = (t_ns - (rec.start_ns or 0)) / 1e9, table.select("acc_x", "acc_y", "acc_z").to_numpy()
     linear = values[:, 2] - _low_pass(t, values[:, 2])
@@ -227,6 +228,7 @@ def threshold(rec: Recording, fig: Figure) -> None:
         )
     for k, topic in enumerate(runs[:3]):
         ends = rec.table(topic)["t_ns"].to_numpy()
+        ends = ends if whole else ends[ends <= t_ns[-1]]
         name = f"{printable(topic.split('/')[2])}: {len(ends)} steps"
         top.plot(
             (ends - (rec.start_ns or 0)) / 1e9,
@@ -237,12 +239,13 @@ def threshold(rec: Recording, fig: Figure) -> None:
         )
     top.set_ylabel("m/s²", fontsize=9)
     top.legend(fontsize=8)
-    _title(top, f"linear vertical acceleration of {printable(acc)}")
+    part = "" if whole else f", the first {t[-1]:.0f} s"
+    _title(top, f"linear vertical acceleration of {printable(acc)}{part}")
     turn = next(
         (t for t, c in rec.channels.items() if c.schema.endswith("/QuaternionStamped") and c.count), None
     )
     if turn is not None:
-        q = rec.table(turn)
+        q, _ = first_rows(rec, turn)
         w, x, y, z = q.select("quat_w", "quat_x", "quat_y", "quat_z").to_numpy().T
         azimuth = np.degrees(np.unwrap(np.arctan2(2 * (x * y - w * z), 1 - 2 * (x * x + z * z))))
         below.plot(

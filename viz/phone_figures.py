@@ -18,6 +18,7 @@ from .canvas import is_estimate
 from .floor import loaders_of
 from .shapes import ELLIPSE95, geo_circle, metres_a_degree
 from .text import printable
+from .thinned import first_rows
 from .underlay import map_underlay
 from .views.base import role_of
 
@@ -53,7 +54,7 @@ def detector(rec: Recording, fig: Figure) -> None:
     ]
     if not topics:
         raise UsageError(f"{rec.path}: nothing for this figure: no accelerometer")
-    table = rec.table(topics[0])
+    table, whole = first_rows(rec, topics[0])
     t = (table["t_ns"].to_numpy() - (rec.start_ns or 0)) / 1e9
     norm = np.linalg.norm(table.select("acc_x", "acc_y", "acc_z").to_numpy(), axis=1)
     s = source_stages(t, norm)
@@ -61,11 +62,12 @@ def detector(rec: Recording, fig: Figure) -> None:
     shown = (t >= first - 1.0) & (t < first - 1.0 + SHOWN_S)
     fig.set_size_inches(10.0, 11.0)
     panels = list(fig.subplots(4, 1, sharex=True))
+    part = "the whole recording" if whole else f"the first {t[-1]:.0f} s"
     marks = (
         ("all peaks and valleys", s.peaks, s.valleys),
         ("beyond the limits mean ± σ", s.high, s.low),
         ("left by the temporal filter", s.kept_high, s.kept_low),
-        (f"{len(s.steps)} steps in the whole recording", s.steps, s.steps[:0]),
+        (f"{len(s.steps)} steps in {part}", s.steps, s.steps[:0]),
     )
     for k, (ax, (title, high, low)) in enumerate(zip(panels, marks, strict=True)):
         ax.plot(t[shown], norm[shown], color=style.NORM, linewidth=0.8, label="‖acc‖")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,6 +18,7 @@ import polars as pl
 from ..recording import Recording
 from ..recording.errors import MarchaError, UsageError
 from ..recording.scratch import scratch_folder
+from ..recording.threads import give_back_memory
 from ..replay.epochs import GAIT
 from ..replay.evaluate import Evaluation, RunEvaluation, evaluate
 from ..replay.metrics import BETWEEN
@@ -311,6 +313,8 @@ def _pictures(rec: Recording) -> Iterable[PagePicture]:
         except UsageError:  # the recording has nothing for it
             continue
         yield PagePicture(kind, "", caption, png, b"")
+        gc.collect()  # a drawn figure holds itself, and its lines
+        give_back_memory()
 
 
 def _viewer(html: Html, rec: Recording) -> None:

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from ..recording import Recording
 from ..recording.errors import UsageError
+from ..replay.trajectory import stances_of
 from . import style
 from .canvas import is_estimate
 from .text import printable
+from .thinned import pieces
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,23 +48,30 @@ def conditions(rec: Recording, fig: Figure) -> None:
             and "detector" in channel.metadata
             and channel.count
             and stance in rec.channels
+            and rec.channels[stance].count
         ):
             runs.setdefault(channel.metadata["detector"], (topic, stance))
     if not runs:
         raise UsageError(
             f"{rec.path}: nothing for this figure: no stance detector; replay a foot estimator first"
         )
-    tables = {name: (rec.table(values), rec.table(stance)) for name, (values, stance) in runs.items()}
-    heights = [
-        h for values, _ in tables.values() for h in [*([1.0] * len(statistics_of(values.columns))), 1.5]
-    ]
+    tables = {name: _shown(rec, values, stance) for name, (values, stance) in runs.items()}
+    heights = [h for both in tables.values() for h in [*([1.0] * len(statistics_of(both.columns))), 1.5]]
     fig.set_size_inches(10.0, 1.0 + 1.7 * sum(heights))
     panels = iter(fig.subplots(len(heights), 1, squeeze=False, height_ratios=heights)[:, 0])
-    for name, (values, stance) in tables.items():
+    for name, both in tables.items():
         topic = runs[name][0]
-        _detector(
-            panels, name, printable(topic.split("/")[2]), values, stance, rec.channels[topic].metadata, rec
-        )
+        _detector(panels, name, printable(topic.split("/")[2]), both, rec.channels[topic].metadata, rec)
+
+
+def _shown(rec: Recording, values: str, stance: str) -> pl.DataFrame:
+    """Return a detector's rows with what came of them, of the time that is shown."""
+    stances = stances_of(pieces(rec, stance))
+    start_ns = rec.channels[values].start_ns or 0
+    first_ns = int(stances[0, 1]) - 10**9 if len(stances) else start_ns
+    inside = pl.col("t_ns").is_between(first_ns, first_ns + round(SHOWN_S * 1e9))
+    statistics, still = (pl.concat([p.filter(inside) for p in pieces(rec, t)]) for t in (values, stance))
+    return statistics.join(still.select("t_ns", "still"), on="t_ns", how="inner").sort("t_ns")
 
 
 def statistics_of(columns: Sequence[str]) -> list[str]:
@@ -103,18 +112,12 @@ def _detector(
     panels: Any,
     name: str,
     run: str,
-    values: pl.DataFrame,
-    stance: pl.DataFrame,
+    both: pl.DataFrame,
     metadata: dict[str, str],
     rec: Recording,
 ) -> None:
-    both = values.join(stance.select("t_ns", "still"), on="t_ns", how="inner").sort("t_ns")
     t = (both["t_ns"].to_numpy() - (rec.start_ns or 0)) / 1e9
     still = both["still"].cast(pl.Boolean).to_numpy()
-    moving = np.flatnonzero(~still & (np.arange(len(t)) > np.argmax(still)))
-    begin = t[moving[0]] - 1.0 if moving.size else t[0]
-    shown = (t >= begin) & (t <= begin + SHOWN_S)
-    t, still, both = t[shown], still[shown], both.filter(pl.Series(shown))
     lanes: list[tuple[str, Bools]] = []
     for statistic in statistics_of(both.columns):
         ax = next(panels)

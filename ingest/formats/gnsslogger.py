@@ -184,7 +184,7 @@ def _utc_ns(frame: pl.DataFrame, boot_ns: list[int], report: ReportBuilder) -> p
     if "boot" not in frame.columns:
         return utc
     boot = frame["boot"]
-    known = boot.is_finite() & (boot.abs() <= MOST_NS)
+    usable = boot.is_finite() & (boot.abs() <= MOST_NS)
     far = boot.is_infinite() | (boot.abs() > MOST_NS)
     if far.any():
         first = int(far.arg_true()[0])
@@ -195,9 +195,9 @@ def _utc_ns(frame: pl.DataFrame, boot_ns: list[int], report: ReportBuilder) -> p
             line=frame["line"][first],
             subject="boot",
         )
-    if not known.any():
+    if not usable.any():
         return utc
-    since = pl.select(pl.when(known).then(boot)).to_series().round().cast(pl.Int64)
+    since = pl.select(pl.when(usable).then(boot)).to_series().round().cast(pl.Int64)
     gap = (utc - since).drop_nulls()
     middle = int(np.median(gap.to_numpy()))
     if int(gap.max()) - int(gap.min()) > _SAME_CLOCK_NS:  # type: ignore[arg-type]
