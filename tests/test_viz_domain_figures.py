@@ -57,7 +57,7 @@ def test_the_steps_that_are_counted_are_the_recordings(recs: dict[str, mr.Record
     rec = recs["phone"]
     length = rec.table("/estimate/phone_fused_phone_imu/step")["length_m"].to_numpy()
     _, lengths, way = viz.figure(rec, kind="steps").axes
-    np.testing.assert_allclose([bar.get_height() for bar in lengths.patches], length)  # type: ignore[attr-defined]
+    np.testing.assert_allclose(lengths.patches[0].get_data().values, length)  # type: ignore[attr-defined]
     np.testing.assert_allclose(np.asarray(way.get_lines()[0].get_ydata()), np.cumsum(length))
 
 
