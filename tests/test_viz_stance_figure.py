@@ -52,7 +52,7 @@ def test_without_a_detector_one_line_says_so(walk: Path) -> None:
 def test_the_viewer_has_a_lane_for_each_condition_and_says_first_what_must_not_be_used(
     tmp_path: Path,
 ) -> None:
-    made = simulate("rectangle", tmp_path, seed=1, laps=2, config="3030")
+    made = simulate("rectangle", tmp_path, seed=1, laps=3, config="3030")
     convert(made.paths, tmp_path / "clipped.mcap")
     out = tmp_path / "out.mcap"
     runs = ["foot.15iez-zaru", "foot.9iez[detector=c1c2c3]"]
