@@ -208,7 +208,7 @@ def test_a_range_dragged_with_a_real_mouse_is_marked_shown_undone_and_saved(
     )
     assert program.stdin is not None
     assert program.stderr is not None
-    late = threading.Timer(120.0, program.kill)  # nothing below waits for ever
+    late = threading.Timer(180.0, program.kill)  # nothing below waits for ever
     late.start()
     try:
         address = heard(program.stderr, "the viewer is at").split()[-1]
@@ -247,7 +247,7 @@ def _dragged(client: Any) -> tuple[int, int] | None:
         while time.monotonic() < until:  # what the viewer answers it has drawn
             client.get_state()
 
-    until = time.monotonic() + 40
+    until = time.monotonic() + 90
     while time.monotonic() < until:
         for y in RULER:
             mouse("mousemove", 600, y)
