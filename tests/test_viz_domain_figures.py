@@ -127,7 +127,7 @@ def test_panels_of_a_walk_are_never_empty(recs: dict[str, mr.Recording]) -> None
     """A phone's sigma says nothing of the height and is drawn all the same; no accelerometer, no panel of it."""
     phone = {ax.get_title(loc="left"): ax for ax in viz.figure(recs["phone"]).axes}
     (own,) = (ax for title, ax in phone.items() if "1σ" in title)
-    heights = np.concatenate([p.vertices[:, 1] for c in own.collections for p in c.get_paths()])
+    heights = np.concatenate([np.asarray(p.vertices)[:, 1] for c in own.collections for p in c.get_paths()])
     assert np.nanmax(heights) > 0.0
     bare = {ax.get_title(loc="left") for ax in viz.figure(recs["indoor"]).axes}
     sensed = any("acc_x" in c.columns for c in recs["indoor"].channels.values())

@@ -87,9 +87,15 @@ def test_no_figure_of_a_walk_holds_a_channel_whole(tmp_path: Path, monkeypatch: 
     assert len(dense) >= 5
     table = Recording.table
 
-    def sparse_only(self: Recording, topic: str, *args: int, **options: bool) -> pl.DataFrame:
+    def sparse_only(
+        self: Recording,
+        topic: str,
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+        log_time: bool = False,
+    ) -> pl.DataFrame:
         assert topic not in dense, f"{topic} is read whole"
-        return table(self, topic, *args, **options)
+        return table(self, topic, start_ns, end_ns, log_time)
 
     monkeypatch.setattr(Recording, "table", sparse_only)
     for kind in OF_A_WALK:
