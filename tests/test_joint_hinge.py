@@ -303,16 +303,21 @@ def camera_chain(
     return tables, at, reference
 
 
+def against_cameras(estimator: str, data_dir: Path, upper: int, axis: str) -> dict[str, float]:
+    """Return the figures of a joint's angle beside the cameras' of the chain."""
+    tables, at, reference = camera_chain(data_dir, upper, axis)
+    results = blocks(make(estimator, axis=axis, sd_mount_deg=0.0), tables)
+    t_ns, knee, sigma = (
+        results[o][c].to_numpy() for o, c in (("joint", "t_ns"), ("joint", "knee"), ("sigma", "knee"))
+    )
+    return mj.figures(t_ns, knee, at, reference, stated=(t_ns, sigma))
+
+
 @pytest.mark.data
 @pytest.mark.parametrize(("upper", "axis", "limit"), [(2, "x", 1.2), (3, "y", 0.5), (4, "z", 1.5)])
 def test_chain_with_cameras(data_dir: Path, upper: int, axis: str, limit: float) -> None:
     """Online, one parameter set, after 1.2 s, bias included, constant delay of 15 ms stated."""
-    tables, at, reference = camera_chain(data_dir, upper, axis)
-    found = blocks(make("joint.hinge", axis=axis, sd_mount_deg=0.0), tables)
-    t_ns, knee, sigma = (
-        found[o][c].to_numpy() for o, c in (("joint", "t_ns"), ("joint", "knee"), ("sigma", "knee"))
-    )
-    figures = mj.figures(t_ns, knee, at, reference, stated=(t_ns, sigma))
+    figures = against_cameras("joint.hinge", data_dir, upper, axis)
     assert figures["rmse_deg"] < limit
     assert figures["within95_percent"] > 95.0
 

@@ -15,12 +15,11 @@ from marcha.algorithms.joint.smooth import JointSmooth
 from marcha.ingest import convert
 from marcha.ingest.simulate import simulate
 from marcha.replay import Run, replay
-from marcha.replay import metrics_joint as mj
 from marcha.study.config import load
 from scipy.spatial.transform import Rotation
 
 from .event_loop import context_of
-from .test_joint_hinge import blocks, camera_chain, simulated
+from .test_joint_hinge import against_cameras, blocks, simulated
 from .test_joint_source import table
 
 
@@ -170,12 +169,7 @@ def test_wobble_of_the_joint_does_not_turn_the_angle_away() -> None:
 @pytest.mark.parametrize(("upper", "axis", "limit"), [(2, "x", 0.5), (3, "y", 0.3), (4, "z", 0.3)])
 def test_chain_with_cameras(data_dir: Path, upper: int, axis: str, limit: float) -> None:
     """Without bias better than online, and inside its stated 95 %; joint 2-3 wobbles by 3° about its hinge."""
-    tables, at, reference = camera_chain(data_dir, upper, axis)
-    found = blocks(make("joint.smooth", axis=axis, sd_mount_deg=0.0), tables)
-    t_ns, knee, sigma = (
-        found[o][c].to_numpy() for o, c in (("joint", "t_ns"), ("joint", "knee"), ("sigma", "knee"))
-    )
-    figures = mj.figures(t_ns, knee, at, reference, stated=(t_ns, sigma))
+    figures = against_cameras("joint.smooth", data_dir, upper, axis)
     assert figures["rmse_unbiased_deg"] < limit
     assert figures["within95_percent"] > 90.0
 
