@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..contract import FloatArray
+from ..numerics import cholesky
 from ..numerics.compiled import compiled, inlined
 
 # Columns of a sample, for each of two segments: rate, force, rate's derivative, integral of the rate.
@@ -63,28 +64,12 @@ def huber(e: float, k: float) -> float:
 def solve(w: Any, n: int, damping: float) -> bool:
     """Solve (N + damping·diag N) x = rhs by Cholesky into ``w.rhs``; False where N is not definite."""
     for i in range(n):
-        for j in range(i + 1):
-            total = w.N[i, j]
-            if i == j:
-                total += damping * w.N[i, i] + 1e-12
-            for k in range(j):
-                total -= w.L[i, k] * w.L[j, k]
-            if i == j:
-                if total <= 0.0:
-                    return False
-                w.L[i, i] = math.sqrt(total)
-            else:
-                w.L[i, j] = total / w.L[j, j]
-    for i in range(n):
-        total = w.rhs[i]
-        for k in range(i):
-            total -= w.L[i, k] * w.rhs[k]
-        w.rhs[i] = total / w.L[i, i]
-    for i in range(n - 1, -1, -1):
-        total = w.rhs[i]
-        for k in range(i + 1, n):
-            total -= w.L[k, i] * w.rhs[k]
-        w.rhs[i] = total / w.L[i, i]
+        for j in range(i):
+            w.L[i, j] = w.N[i, j]
+        w.L[i, i] = w.N[i, i] + (damping * w.N[i, i] + 1e-12)
+    if not cholesky.factorize(w.L, n):
+        return False
+    cholesky.solve(w.L, n, w.rhs)
     return True
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..contract import FloatArray, IntArray
+from ..numerics import cholesky
 from ..numerics.compiled import compiled
 from ..numerics.records import record_type
 from . import merge
@@ -116,23 +117,6 @@ def difference(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 
 
 @compiled
-def cholesky(w: Any) -> bool:
-    """Write the lower Cholesky factor of ``w.L`` over it; False where it is not positive definite."""
-    for j in range(N):
-        for i in range(j, N):
-            total = w.L[i, j]
-            for k in range(j):
-                total -= w.L[i, k] * w.L[j, k]
-            if i == j:
-                if total <= 0.0:
-                    return False
-                w.L[j, j] = math.sqrt(total)
-            else:
-                w.L[i, j] = total / w.L[j, j]
-    return True
-
-
-@compiled
 def gain(w: Any, log: Any, after: Any) -> bool:
     """Write C = P Fᵀ P⁻₊⁻¹ to ``w.C``."""
     for a in range(N):
@@ -148,17 +132,10 @@ def gain(w: Any, log: Any, after: Any) -> bool:
                     + after.rot_before[i, k, 1] * log.P[a, p + 4]
                     + after.rot_before[i, k, 2] * log.P[a, p + 5]
                 )
-    if not cholesky(w):
+    if not cholesky.factorize(w.L, N):
         return False
     for a in range(N):
-        for j in range(N):
-            for k in range(j):
-                w.C[a, j] -= w.L[j, k] * w.C[a, k]
-            w.C[a, j] /= w.L[j, j]
-        for j in range(N - 1, -1, -1):
-            for k in range(j + 1, N):
-                w.C[a, j] -= w.L[k, j] * w.C[a, k]
-            w.C[a, j] /= w.L[j, j]
+        cholesky.solve(w.L, N, w.C[a])
     return True
 
 
