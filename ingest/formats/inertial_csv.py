@@ -56,6 +56,7 @@ _UNIT_WORDS = {"g": "g", "mg": "mg", "ms2": "m/s2", "mps2": "m/s2", "dps": "deg/
     "ns": "ns",
 }
 """Units that stand behind an underscore or a blank."""
+_PLACE = re.compile(r"(?i)lat(?:itude)?|lng|lon(?:g(?:itude)?)?")
 _BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]")
 _PARTS = re.compile(r"[A-Z]?[a-z0-9]+|[A-Z]+(?![a-z])")
 
@@ -166,6 +167,8 @@ def _meaning(name: str) -> _Meaning | None:
 
 
 def _is_header(cells: Sequence[str]) -> bool:
+    if any(_PLACE.fullmatch(c.strip()) for c in cells):  # a phone's log, which an importer of its own reads
+        return False
     named = [f"{m.quantity}_{m.axis}" for c in cells if (m := _meaning(c))]
     return len(set(named)) == len(named) and {"t_", *ACC, *GYR} <= set(named)
 
