@@ -79,7 +79,7 @@ def skewness(w: Any, rows: FloatArray, count: int, lag: int) -> float:
 
 @compiled
 def orient(s: Any, lag: int) -> None:
-    """Set the long axes ``s.up``, and the sign of axes that lie far off the given one (:func:`.common.long_axes`)."""
+    """Set the long axes ``s.up`` (as :func:`long_axes`), and the sign of axes that lie far off the given one."""
     s.skew = skewness(s, s.rows, s.kept, lag)
     far = 0.0
     for m in range(3):
