@@ -65,6 +65,10 @@ def _hour(seconds: int) -> dict[str, pl.DataFrame]:
         "mag": vectors("mag", walk.mag_b),
         "pressure": repeated(walk.pressure["t_ns"], {"pressure_pa": walk.pressure["pressure_pa"].to_numpy()}),
         "gnss": repeated(walk.fixes["t_ns"], fixes),
+        "velocity": repeated(
+            walk.fixes["t_ns"],
+            {f"vel_{a}": walk.fixes[f"vel_{b}"] for a, b in (("x", "east"), ("y", "north"))},
+        ),
     }
 
 

@@ -18,6 +18,7 @@ import polars as pl
 from ..recording.errors import MarchaError
 from .checks import SensorCheck, check_plausible
 from .contract import ChannelSpec, ReportBuilder, SourceAttachment
+from .fixes import finished_fixes, velocities, velocity_spec
 from .inertial import ACC, GYR, IMU, MAG, Plateau, SourceColumn
 from .inertial import FIELD as FIELD
 from .radio import without_stale
@@ -37,13 +38,8 @@ AXES = (
     "at rest with the screen up"
 )
 MICROTESLA, HECTOPASCAL = 1e-6, 100.0
-RADIAL_68 = float(np.sqrt(-2 * np.log(0.32)))
-"""Radius of 68 % of a plane's Gaussian, in standard deviations of an axis: phones state that radius."""
 NO_GRAVITY = 4.0
 """A median norm (m/s²) below this has no gravity in it."""
-PACKED_S, PACKED_MPS, PACKED_RUN = 0.2, 10.0, 3
-"""So many fixes in a row, faster than 5 Hz and further apart than a pedestrian goes, have no times."""
-
 Make = Callable[[pl.DataFrame], Mapping[str, Any]]
 
 
@@ -62,7 +58,8 @@ class StreamChannel:
     held : bool
         Whether a reading stands on every row until there is a new one.
     fixes : bool
-        Whether the columns are ``lat, lon, alt, accuracy, vertical`` of fixes (the last three where given).
+        Whether the columns are ``lat, lon, alt, accuracy, vertical`` of fixes (the last three where given), and
+        ``speed`` (m/s) and ``course`` (degrees clockwise from true north) of the receiver's own velocity.
     metadata : mapping of str to str
         Of the channel.
     """
@@ -97,12 +94,17 @@ def imu_part(topic: str, columns: Mapping[str, SourceColumn], **metadata: str) -
     return StreamChannel(topic, IMU, columns, metadata=metadata)
 
 
-def fix_part(columns: Mapping[str, str], topic: str = "/phone/gnss", **metadata: str) -> StreamChannel:
-    """Return the channel of fixes from ``lat, lon, alt, accuracy, vertical`` and the names of their cells."""
+def fix_part(
+    columns: Mapping[str, str], topic: str = "/phone/gnss", speed_factor: float = 1.0, **metadata: str
+) -> StreamChannel:
+    """Return the channel of fixes: from the columns of :class:`StreamChannel` to the names of their cells.
+
+    With ``speed`` and ``course`` there is a second channel, ``<topic>_velocity``.
+    """
     return StreamChannel(
         topic,
         FIX,
-        {k: SourceColumn(v, 1.0) for k, v in columns.items()},
+        {k: SourceColumn(v, speed_factor if k == "speed" else 1.0) for k, v in columns.items()},
         held=True,
         fixes=True,
         frame_id="wgs84",
@@ -137,6 +139,13 @@ def rotation_vector(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> dict[str, np
 def whole_ns(values: pl.Series, per_microsecond: float) -> pl.Series:
     """Return times as whole ns, exact to the µs: ``values`` times ``per_microsecond`` are microseconds."""
     return pl.Series(np.round(values.to_numpy() * per_microsecond).astype(np.int64) * 1000)
+
+
+def _velocity(part: StreamChannel) -> list[ChannelSpec]:
+    """Return the channel of the receiver's velocity, where fixes have one."""
+    if not part.fixes or callable(part.columns) or not {"speed", "course"} <= set(part.columns):
+        return []
+    return [velocity_spec(part.topic)]
 
 
 class Stream:
@@ -210,6 +219,10 @@ class Stream:
                 )
                 if table.height:
                     yield part.topic, table.drop("line")
+                for spec in _velocity(part):
+                    table = velocities(pl.concat(self._fixes[part.topic]))
+                    if table.height:
+                        yield spec.topic, table
         for check in self._checks.values():
             check.finish()
 
@@ -354,111 +367,6 @@ class _Check:
         self._plateau.finish()
 
 
-def finished_fixes(
-    topic: str, fixes: pl.DataFrame, report: ReportBuilder, attachments: list[SourceAttachment]
-) -> pl.DataFrame:
-    """Return fixes in the columns of NavSatFix, with what is wrong about them reported.
-
-    Parameters
-    ----------
-    topic : str
-        Of the channel.
-    fixes : polars.DataFrame
-        ``t_ns, line, lat, lon`` and where given ``alt, accuracy, vertical`` (m, 68 %).
-    report : ReportBuilder
-        Takes what is found.
-    attachments : list of SourceAttachment
-        Takes positions without times.
-    """
-    lat, lon = fixes["lat"].to_numpy(), fixes["lon"].to_numpy()
-    bad = (np.abs(lat) > 90) | (np.abs(lon) > 180) | ((lat == 0) & (lon == 0))
-    if bad.any():
-        report.loss(
-            "no_fix",
-            f"{topic}: latitude {lat[bad][0]:g}, longitude {lon[bad][0]:g} is no place: no message",
-            count=int(bad.sum()),
-            line=int(fixes["line"][int(np.argmax(bad))]),
-            subject=topic,
-        )
-        fixes = fixes.filter(pl.Series(~bad))
-    fixes = _without_packed(topic, fixes, report, attachments)
-    _coarse(topic, fixes, report)
-    nothing = np.full(fixes.height, np.nan)
-    stated = {}
-    for name in ("accuracy", "vertical"):
-        if name not in fixes.columns:
-            stated[name] = nothing
-            continue
-        value = fixes[name].to_numpy()
-        none = value <= 0
-        if none.any():
-            report.note(
-                "missing_cell",
-                f"{topic} {name}: {value[none][0]:g} says that there is none: missing",
-                count=int(none.sum()),
-                line=int(fixes["line"][int(np.argmax(none))]),
-                subject=f"{topic} {name}",
-            )
-        stated[name] = np.where(none, np.nan, value)
-    out = {"lat_deg": fixes["lat"], "lon_deg": fixes["lon"]}
-    if "alt" in fixes.columns:
-        out["alt_m"] = fixes["alt"]
-    table = fixes.select("t_ns", "line").with_columns(**out)
-    if not np.isnan(stated["accuracy"]).all():
-        side = pl.Series(stated["accuracy"] / RADIAL_68)
-        table = table.with_columns(sd_east_m=side, sd_north_m=side, sd_up_m=pl.Series(stated["vertical"]))
-    return table
-
-
-def _without_packed(
-    topic: str, fixes: pl.DataFrame, report: ReportBuilder, attachments: list[SourceAttachment]
-) -> pl.DataFrame:
-    """Return the fixes without those that stand on rows too fast to be their times."""
-    if fixes.height < PACKED_RUN:
-        return fixes
-    lat, lon = np.radians(fixes["lat"].to_numpy()), np.radians(fixes["lon"].to_numpy())
-    dt = np.diff(fixes["t_ns"].to_numpy()) / 1e9
-    metres = 6.371e6 * np.hypot(np.diff(lat), np.diff(lon) * np.cos(lat[:-1]))
-    fast = (dt < PACKED_S) & (metres > PACKED_MPS * np.maximum(dt, 1e-3))
-    packed = np.zeros(fixes.height, dtype=bool)
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], fast, [False])).astype(np.int8)))
-    for a, b in zip(edges[::2], edges[1::2], strict=True):
-        if b - a + 1 >= PACKED_RUN:
-            packed[a : b + 1] = True
-    if packed.any():
-        places = fixes.filter(pl.Series(packed))
-        report.loss(
-            "packed_fixes",
-            f"{topic}: {places.height} fixes stand {1e3 * float(np.median(dt[fast])):.0f} ms apart with jumps of "
-            f"{metres[fast].min():.1f} … {metres[fast].max():.1f} m: a list of positions without their times; "
-            "kept as an attachment, not as fixes",
-            count=places.height,
-            line=int(places["line"][0]),
-            subject=topic,
-        )
-        table = places.select(lat_deg="lat", lon_deg="lon").write_csv().encode()
-        attachments.append(SourceAttachment("packed_fixes.csv", table, "text/csv"))
-    return fixes.filter(pl.Series(~packed))
-
-
-def _coarse(topic: str, fixes: pl.DataFrame, report: ReportBuilder) -> None:
-    """Report positions that were rounded to three decimals or fewer."""
-    lat = fixes["lat"].to_numpy()
-    if lat.size < 3:
-        return
-    for decimals in range(4):
-        if np.abs(lat * 10**decimals - np.round(lat * 10**decimals)).max() < 1e-7 * 10**decimals:
-            report.loss(
-                "rounded",
-                f"{topic}: latitudes are kept to {decimals} decimals, {1.1e5 / 10**decimals:.0f} m apart: rounded "
-                "by another program",
-                count=lat.size,
-                line=int(fixes["line"][0]),
-                subject=topic,
-            )
-            return
-
-
 def require_rows(path: Path, streams: Sequence[Stream]) -> None:
     """Raise where nothing was read.
 
@@ -473,4 +381,4 @@ def require_rows(path: Path, streams: Sequence[Stream]) -> None:
 
 def declared(streams: Iterable[Stream]) -> list[ChannelSpec]:
     """Return the channels of all streams."""
-    return [p.spec() for s in streams for p in s.parts]
+    return [spec for s in streams for p in s.parts for spec in (p.spec(), *_velocity(p))]

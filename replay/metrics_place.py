@@ -8,7 +8,9 @@ measured beside its errors.
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,6 +23,8 @@ from .alignment import IntArray, match
 from .trajectory import stepwise, track_of
 
 if TYPE_CHECKING:
+    from scipy.spatial import KDTree
+
     from .view import RunView
 
 ELLIPSE95 = 5.991464547107979
@@ -29,6 +33,8 @@ REFERENCE_GAP_S = 2.5
 """Fixes of a reference farther apart are not interpolated between."""
 LINE_GAP_M = 20.0
 """Places of a survey farther apart are not joined: nobody knows how the route went there."""
+PIECE_M = 1.0
+"""Longest piece of a survey's line; longer ones are cut, so that a tree of their middles finds the nearest."""
 END_M = 2.0
 SHAPE_ROUNDS = 60
 
@@ -253,7 +259,19 @@ class SurveyLine:
             return None
         before, after = np.concatenate(([False], joined[:-1])), np.concatenate((joined[1:], [False]))
         ends = np.vstack((xy[:-1][joined & ~before], xy[1:][joined & ~after]))
-        return cls(np.stack((xy[:-1], xy[1:]), axis=1)[joined], ends)
+        pieces = np.stack((xy[:-1], xy[1:]), axis=1)[joined]
+        count = np.ceil(np.hypot(*(pieces[:, 1] - pieces[:, 0]).T) / PIECE_M).astype(int)
+        which = np.repeat(np.arange(len(pieces)), count)
+        part = (np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count))[:, None]
+        way = (pieces[which, 1] - pieces[which, 0]) / count[which, None]
+        begin = pieces[which, 0] + part * way
+        return cls(np.stack((begin, begin + way), axis=1), ends)
+
+    @cached_property
+    def _middles(self) -> KDTree:
+        from scipy.spatial import KDTree
+
+        return KDTree(self.pieces.mean(axis=1))
 
     def nearest(self, points: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Return the nearest places on the line, (n, 2), and whether the points lie beside it, (n,).
@@ -261,12 +279,16 @@ class SurveyLine:
         A point whose nearest place is an end of the line lies beyond it, where nothing is known. Whoever
         surveys stands still at an end: places within :data:`END_M` of it are the end.
         """
+        tree = self._middles
         begin, way = self.pieces[:, 0], self.pieces[:, 1] - self.pieces[:, 0]
         length = np.maximum((way**2).sum(axis=1), 1e-12)
+        # The nearest piece lies no farther than the nearest middle, and its own middle half a piece beyond.
+        reach = tree.query(points)[0] + 0.5 * math.sqrt(length.max()) + 1e-9
         out = np.empty_like(points)
-        for k, p in enumerate(points):
-            part = np.clip(((p - begin) * way).sum(axis=1) / length, 0.0, 1.0)
-            on = begin + part[:, None] * way
+        for k, near in enumerate(tree.query_ball_point(points, reach)):
+            p, b, w = points[k], begin[near], way[near]
+            part = np.clip(((p - b) * w).sum(axis=1) / length[near], 0.0, 1.0)
+            on = b + part[:, None] * w
             out[k] = on[np.argmin(((on - p) ** 2).sum(axis=1))]
         at_end = (np.hypot(*(out[:, None] - self.ends).transpose(2, 0, 1)) < END_M).any(axis=1)
         return out, ~(at_end & (np.hypot(*(points - out).T) > END_M))

@@ -155,7 +155,8 @@ class RecordingSource:
     max_rows : int
         Largest number of rows in a batch; bounds memory.
     withheld : mapping of str to sequence of (int, int), optional
-        Messages that are kept back, by topic: from when to when (log time in ns, half open).
+        Messages that are kept back, by topic: from when to when (log time in ns, half open). With the fixes of a
+        receiver goes its velocity (``<topic>_velocity``).
     """
 
     seekable = True
@@ -172,6 +173,9 @@ class RecordingSource:
             if topic not in recording.channels:
                 there = ", ".join(recording.channels) or "none"
                 raise UsageError(f"{recording.path}: no channel {topic} to withhold; there are {there}")
+        for topic, spans in list(self.withheld.items()):
+            if (velocity := f"{topic}_velocity") in recording.channels:
+                self.withheld.setdefault(velocity, spans)
         self.name = Path(recording.path).name
         self.max_rows = max_rows
         self.channels: dict[str, PlannedChannel] = {

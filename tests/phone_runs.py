@@ -17,8 +17,9 @@ PLACEMENTS = ("hand", "pocket", "bag", "armband", "neck", "swinging")
 Places = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
-def sensor_tables(walk: PhoneWalk) -> dict[str, pl.DataFrame]:
-    """Return what each input of a phone's estimator is served with."""
+def sensor_tables(walk: PhoneWalk, *, velocity: bool = False) -> dict[str, pl.DataFrame]:
+    """Return what each input of a phone's estimator is served with; ``velocity``: the receiver's, too."""
+    moving = walk.fixes.select("t_ns", vel_x="vel_east", vel_y="vel_north")
     t_ns = pl.Series("t_ns", walk.t_ns)
 
     def table(name: str, values: np.ndarray) -> pl.DataFrame:
@@ -30,6 +31,7 @@ def sensor_tables(walk: PhoneWalk) -> dict[str, pl.DataFrame]:
         "mag": table("mag", walk.mag_b),
         "pressure": walk.pressure,
         "gnss": walk.fixes.select("t_ns", *FIXES).with_columns(status=pl.lit(0)),
+        "velocity": moving if velocity else moving.clear(),
     }
 
 
@@ -83,9 +85,9 @@ def run_phone(name: str, tables: dict[str, pl.DataFrame], **params: Any) -> dict
     return found
 
 
-def fused(walk: PhoneWalk) -> Places:
+def fused(walk: PhoneWalk, *, velocity: bool = False) -> Places:
     """Return times (s), errors (n, 2) in metres, and covariances (n, 2, 2) that ``phone.fused`` states."""
-    out = run_phone("phone.fused", sensor_tables(walk))
+    out = run_phone("phone.fused", sensor_tables(walk, velocity=velocity))
     fix = out["fix"]
     t = fix["t_ns"].to_numpy() - walk.t_ns[0]
     place = Plane(walk.options.lat_deg, walk.options.lon_deg)(fix)
@@ -94,7 +96,7 @@ def fused(walk: PhoneWalk) -> Places:
 
 
 @cache
-def carried(seed: int, scenario: str = "phone-100m") -> Places:
+def carried(seed: int, scenario: str = "phone-100m", *, velocity: bool = False) -> Places:
     """Return :func:`fused` of a walk whose placement, course and gait the seed draws."""
     rng = np.random.default_rng(seed)
     options: dict[str, Any] = {
@@ -103,4 +105,4 @@ def carried(seed: int, scenario: str = "phone-100m") -> Places:
         "step_m": float(rng.uniform(0.6, 0.8)),
         "step_s": float(rng.uniform(0.5, 0.6)),
     }
-    return fused(phone_walk(scenario, seed=seed, rate_hz=25, pressure_hz=0, **options))
+    return fused(phone_walk(scenario, seed=seed, rate_hz=25, pressure_hz=0, **options), velocity=velocity)

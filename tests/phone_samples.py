@@ -30,13 +30,18 @@ def seconds(walk: PhoneWalk, t_ns: np.ndarray | None = None) -> np.ndarray:
 def fixes(walk: PhoneWalk) -> np.ndarray:
     """Return t (s), latitude, longitude, height, speed, course, accuracies: phyphox's columns."""
     f = walk.fixes
-    n = f.height
     columns = [
         seconds(walk, f["t_ns"].to_numpy()),
         *(f[c].to_numpy() for c in ("lat_deg", "lon_deg", "alt_m")),
     ]
     accuracy = f["sd_east_m"].to_numpy() * np.sqrt(-2 * np.log(0.32))
-    return np.column_stack([*columns, np.full(n, -1), np.full(n, -1), accuracy, f["sd_up_m"].to_numpy()])
+    return np.column_stack([*columns, *velocity(walk), accuracy, f["sd_up_m"].to_numpy()])
+
+
+def velocity(walk: PhoneWalk) -> tuple[np.ndarray, np.ndarray]:
+    """Return speed (m/s) and course (degrees clockwise from north) of the receiver at the fixes."""
+    east, north = (walk.fixes[c].to_numpy() for c in ("vel_east", "vel_north"))
+    return np.hypot(east, north), np.degrees(np.arctan2(east, north)) % 360
 
 
 def phyphox(folder: Path, walk: PhoneWalk, separator: str = ",") -> Path:
@@ -67,7 +72,9 @@ ANDROSENSOR = (
     "LOCATION Latitude : ",
     "LOCATION Longitude : ",
     "LOCATION Altitude ( m)",
+    "LOCATION Speed ( Kmh)",
     "LOCATION Accuracy ( m)",
+    "LOCATION ORIENTATION (°)",
     "Time since start in ms ",
     "YYYY-MO-DD HH-MI-SS_SSS",
 )
@@ -75,16 +82,23 @@ ANDROSENSOR = (
 
 def held_fixes(walk: PhoneWalk) -> np.ndarray:
     """Return latitude, longitude, height and accuracy on every sample: the last one so far, NaN before the first."""
-    f = fixes(walk)
+    return held(walk, fixes(walk)[:, [1, 2, 3, 6]])
+
+
+def held(walk: PhoneWalk, values: np.ndarray) -> np.ndarray:
+    """Return values of the fixes on every sample: the last one so far, NaN before the first."""
     at = np.searchsorted(walk.fixes["t_ns"].to_numpy(), walk.t_ns, side="right") - 1
-    out = f[np.maximum(at, 0)][:, [1, 2, 3, 6]]
+    out = values[np.maximum(at, 0)]
     out[at < 0] = np.nan
     return out
 
 
 def androsensor(path: Path, walk: PhoneWalk) -> Path:
     """Write AndroSensor's table: empty cells before the first fix, milliseconds behind a colon."""
-    rows = np.hstack((walk.acc_b, walk.gyr_b, walk.mag_b * 1e6, held_fixes(walk)))
+    *place, accuracy = held_fixes(walk).T
+    kmh, course = held(walk, np.column_stack(velocity(walk)) * (3.6, 1.0)).T
+    location = np.column_stack((*place, kmh, accuracy, course))
+    rows = np.hstack((walk.acc_b, walk.gyr_b, walk.mag_b * 1e6, location))
     ms = np.round(seconds(walk) * 1e3).astype(int)
     lines = [",".join(ANDROSENSOR)]
     for row, t in zip(rows, ms, strict=True):
@@ -250,10 +264,10 @@ def getsensordata_21(path: Path, walk: PhoneWalk) -> Path:
             rows.append(f"BLE4;{s:.3f};Eddystone;e0:78:a3:3d:b5:ac;-80;0102")
             rows.append(f"BLUE;{s:.3f};watch;e0:78:a3:3d:b5:ad;-60")
             rows.append(f"SOUN;{s:.3f};210.1;0.02;61.2")
-    for f in walk.fixes.iter_rows(named=True):
+    for f, speed, course in zip(walk.fixes.iter_rows(named=True), *velocity(walk), strict=True):
         s = (f["t_ns"] - walk.t_ns[0]) / 1e9
         place = f"{f['lat_deg']:.8f};{f['lon_deg']:.8f};{f['alt_m']:.3f}"
-        rows.append(f"GNSS;{s:.3f};{f['t_ns'] / 1e9:.3f};{place};0.0;4.5;1.2;20;9")
+        rows.append(f"GNSS;{s:.3f};{f['t_ns'] / 1e9:.3f};{place};{course:.6f};4.5;{speed:.6f};20;9")
     o = walk.options
     rows.append(f"POSI;{seconds(walk)[-1]:.3f};1;{o.lat_deg};{o.lon_deg};0;0")
     path.write_text("\n".join([*rows, ""]))
@@ -289,10 +303,11 @@ def gnsslogger_v3(path: Path, walk: PhoneWalk) -> Path:
         "UnixTimeMillis,SpeedAccuracyMps,BearingAccuracyDegrees,elapsedRealtimeNanos,VerticalAccuracyMeters,MockLocation"
     )
     boot = int(walk.t_ns[0]) - 65_972_055_195_160
-    for f in walk.fixes.iter_rows(named=True):
+    for f, speed, course in zip(walk.fixes.iter_rows(named=True), *velocity(walk), strict=True):
         for provider, off in (("GPS", 0.0), ("FLP", 2e-5), ("NLP", 3e-3)):
             rows.append(
-                f"Fix,{provider},{f['lat_deg'] + off:.10f},{f['lon_deg']:.10f},{f['alt_m']:.9f},0.9,4.5,108.3,"
+                f"Fix,{provider},{f['lat_deg'] + off:.10f},{f['lon_deg']:.10f},{f['alt_m']:.9f},{speed:.7f},4.5,"
+                f"{course:.6f},"
                 f"{f['t_ns'] // 1_000_000},,,{f['t_ns'] - boot},11.185,0"
             )
     rows += ["Status,1663712658000,18,0,1,1,,12.80,285.0,16.0,1,1,0,", "Nav,3,769,1,-1,14,116,5,-126,11"]
@@ -379,7 +394,8 @@ def sensor_logger(folder: Path, walk: PhoneWalk, platform: str = "android", stan
         )
         (folder / f"{name}.csv").write_text("\n".join(["time,seconds_elapsed,z,y,x", *rows, ""]))
     rows = [
-        f"{f[0] * 1e9 + walk.t_ns[0]:.0f},{f[0]:.6f},{f[7]:.6f},{f[6]:.6f},-1,-1,{f[3]:.4f},{f[2]:.12f},{f[1]:.12f}"
+        f"{f[0] * 1e9 + walk.t_ns[0]:.0f},{f[0]:.6f},{f[7]:.6f},{f[6]:.6f},{f[4]:.7f},{f[5]:.6f},"
+        f"{f[3]:.4f},{f[2]:.12f},{f[1]:.12f}"
         for f in fixes(walk)
     ]
     head = (

@@ -17,8 +17,10 @@ from marcha.ingest import convert, recognise
 from marcha.ingest.archive import unpack
 from marcha.ingest.batch import logs
 from marcha.ingest.formats.android_text import AndroidText
+from marcha.ingest.formats.androsensor import AndroSensor
 from marcha.ingest.formats.getsensordata import GetSensorData
 from marcha.ingest.formats.gnsslogger import GnssLogger
+from marcha.ingest.formats.phyphox import Phyphox
 from marcha.ingest.formats.sensor_logger import SensorLogger
 from marcha.ingest.formats.tracks import Gpx, Kml
 from marcha.ingest.simulate import PhoneWalk
@@ -189,6 +191,37 @@ def test_getsensordata_takes_the_sensors_clock(tmp_path: Path, walk: PhoneWalk) 
     assert np.abs(intervals).max() <= 2000  # not the 4 ms of the app
     assert tables["/phone/radio"]["mac"][0] == "16:74:9c:2b:4d:1b"
     assert tables["/reference/fix"].height == 1
+
+
+@pytest.mark.parametrize("app", ["phyphox", "androsensor", "sensor_logger", "getsensordata", "gnsslogger"])
+def test_speed_and_course_are_the_receivers_velocity(tmp_path: Path, walk: PhoneWalk, app: str) -> None:
+    importer, path = {
+        "phyphox": (Phyphox(), lambda: samples.phyphox(tmp_path, walk)),
+        "androsensor": (AndroSensor(), lambda: samples.androsensor(tmp_path / "a.csv", walk)),
+        "sensor_logger": (SensorLogger(), lambda: samples.sensor_logger(tmp_path / "log", walk)),
+        "getsensordata": (GetSensorData(), lambda: samples.getsensordata_21(tmp_path / "g.txt", walk)),
+        "gnsslogger": (GnssLogger(), lambda: samples.gnsslogger_v3(tmp_path / "gnss_log.txt", walk)),
+    }[app]
+    imported, tables, _ = read(importer, path())
+    table = tables["/phone/gnss_velocity"]
+    assert table["t_ns"].equals(tables["/phone/gnss"]["t_ns"])
+    assert same(table, ["vel_x", "vel_y"], walk.fixes.select("vel_east", "vel_north").to_numpy(), 1e-4)
+    assert table["vel_z"].is_nan().all()
+    assert next(c.frame_id for c in imported.channels if c.topic == "/phone/gnss_velocity") == "enu"
+
+
+@pytest.mark.parametrize(("speed", "course"), [("-1", "-1"), ("0.0", "0.0"), ("", ""), ("1.2", "")])
+def test_a_velocity_that_is_none_is_no_message(
+    tmp_path: Path, walk: PhoneWalk, speed: str, course: str
+) -> None:
+    path = samples.phyphox(tmp_path, walk) / "Location.csv"
+    head, *rows = path.read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    cells[1][4:6] = speed, course
+    path.write_text("\n".join([head, *(",".join(c) for c in cells), ""]))
+    _, tables, _ = read(Phyphox(), tmp_path)
+    assert tables["/phone/gnss"].height == walk.fixes.height
+    assert tables["/phone/gnss_velocity"].height == walk.fixes.height - 1
 
 
 def test_gnsslogger_takes_the_bias_off(tmp_path: Path, walk: PhoneWalk) -> None:

@@ -180,6 +180,8 @@ def test_a_loss_reaches_the_estimator_and_not_the_recording(walk: mr.Recording, 
     assert done.table("/phone/gnss").equals(walk.table("/phone/gnss"))
     kept = int(((fixes < begin) | (fixes >= begin + 40 * S)).sum())
     assert result.runs[0].tables["state"]["fixes"][-1] == kept
+    velocities = rp.RecordingSource(walk, withheld=spans).batches(["/phone/gnss_velocity"])
+    assert sum(b.tables["/phone/gnss_velocity"].height for b in velocities) == kept  # they are lost, too
     again = rp.evaluate(done).runs[0].metrics  # the loss is in the run's record
     assert again["loss_error_m"] == pytest.approx(result.runs[0].metrics["loss_error_m"])
     assert 0.0 < again["loss_error_m"] < 8.0

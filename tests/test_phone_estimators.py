@@ -22,7 +22,7 @@ from .phone_samples import short_walk
 @cache
 def sensors() -> dict[str, pl.DataFrame]:
     """Return tables of a walk of 10 m by sensor, about 12 s."""
-    return sensor_tables(short_walk(rate_hz=25, rest_s=1.5, pressure_hz=1, seed=4))
+    return sensor_tables(short_walk(rate_hz=25, rest_s=1.5, pressure_hz=1, seed=4), velocity=True)
 
 
 class PhoneContract(EstimatorContract):

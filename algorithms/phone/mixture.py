@@ -6,7 +6,8 @@ of another accuracy come from another source (:data:`OTHER_SOURCE`), and the rat
 the gyroscope's bias about the vertical). An unknown initial
 heading is a ring of hypotheses, not a linearization. A fix is an inlier or an outlier with stated
 probabilities; each hypothesis is corrected by its inlier's share (probabilistic data association, Bar-Shalom), so
-that a fix far off moves nothing and a doubtful one a little, with the covariance to match.
+that a fix far off moves nothing and a doubtful one a little, with the covariance to match. A receiver's own
+velocity (Doppler) says in the same way how headings and lengths are to be corrected.
 """
 
 from __future__ import annotations
@@ -21,6 +22,11 @@ N = 7
 HYPOTHESES = 12
 OTHER_SOURCE = 3.0
 """Factor between stated accuracies from which on fixes come from another source (cells instead of satellites)."""
+
+VELOCITY_TAU_S = 4.0
+"""Receivers filter their velocity: readings closer in time than this say the same again."""
+VELOCITY_OUTLIER = 1.0
+"""Deviation an axis (m/s) that a wrong velocity has beside the stated one."""
 
 FIELDS: list[tuple[Any, ...]] = [
     ("hyp", "i8"),  # number of hypotheses that are alive
@@ -41,6 +47,7 @@ FIELDS: list[tuple[Any, ...]] = [
     ("gm_tau", "f8"),
     ("gm_sd", "f8"),  # stationary standard deviation of the slow error now modelled (m)
     ("outlier", "f8"),
+    ("velocity_ns", "i8"),  # when the last velocity was taken
     ("mean", "f8", (4,)),  # mixture: east, north, heading correction, scale
     ("cov", "f8", (4,)),  # east, east-north, north; variance of the heading correction
     ("fixes", "i8"),
@@ -174,18 +181,61 @@ def fix(s: Any, t_ns: int, east: float, north: float, sd: float) -> None:
             s.hP[h, 0, 0] += 1e8
             s.hP[h, 1, 1] += 1e8
         for h in range(s.hyp):
-            _correct(s, h, east, north, white, 1.0)
+            a, b, c = _innovation(s, h, white)
+            _place_gain(s, h)
+            _correct(s, h, east - s.hx[h, 0] - s.hx[h, 4], north - s.hx[h, 1] - s.hx[h, 5], a, b, c, 1.0)
         summarize(s)
         return
     total, outside = 0.0, 0.0
     for h in range(s.hyp):
-        p_in, p_out = _likelihoods(s, h, east, north, white)
-        share = (1.0 - s.outlier) * p_in / ((1.0 - s.outlier) * p_in + s.outlier * p_out)
-        s.hw[h] *= (1.0 - s.outlier) * p_in + s.outlier * p_out
+        x, y = east - s.hx[h, 0] - s.hx[h, 4], north - s.hx[h, 1] - s.hx[h, 5]
+        a, b, c = _innovation(s, h, white)
+        share = _weigh(s, h, x, y, a, b, c, 2500.0)  # an outlier has 50 m more an axis
         total += s.hw[h]
         outside += s.hw[h] * (1.0 - share)
-        _correct(s, h, east, north, white, share)
+        _place_gain(s, h)
+        _correct(s, h, x, y, a, b, c, share)
     s.outliers += outside / total if total > 0.0 else 1.0
+    _judge(s, total)
+
+
+@compiled
+def velocity(s: Any, t_ns: int, walked: Any, east: float, north: float, sd: float) -> None:
+    """Take a receiver's velocity (m/s, standard deviation an axis ``sd``) beside that of the steps.
+
+    ``walked``: velocity by steps and headings before correction (east, north), its mean square (m²/s²). Where
+    their mean over a turn is short, the readings lag behind in an unknown way: that is noise, too.
+    """
+    age(s, t_ns)
+    pace = walked[0] ** 2 + walked[1] ** 2
+    more = 1.0
+    if s.velocity_ns != 0:
+        more = max(1.0, VELOCITY_TAU_S / max((t_ns - s.velocity_ns) * 1e-9, 0.1))
+    s.velocity_ns = t_ns
+    total = 0.0
+    for h in range(s.hyp):
+        k = math.exp(s.hx[h, 3])
+        c, w = k * math.cos(s.hx[h, 2]), k * math.sin(s.hx[h, 2])
+        e, n = c * walked[0] - w * walked[1], w * walked[0] + c * walked[1]
+        noise = more * sd * sd + k * k * max(walked[2] - pace, 0.0)
+        noise += 0.5 * k * k * pace * max(s.q_length**2, s.q_heading**2)
+        # H has (−n, e) for the heading and (e, n) for the scale.
+        tt, ts, ss = s.hP[h, 2, 2], s.hP[h, 2, 3], s.hP[h, 3, 3]
+        a = n * n * tt - 2.0 * n * e * ts + e * e * ss + noise
+        b = -n * e * tt + (e * e - n * n) * ts + e * n * ss
+        d = e * e * tt + 2.0 * e * n * ts + n * n * ss + noise
+        share = _weigh(s, h, east - e, north - n, a, b, d, VELOCITY_OUTLIER**2)
+        total += s.hw[h]
+        for i in range(N):
+            turn, scale = s.hP[h, i, 2], s.hP[h, i, 3]
+            s.work[0, i], s.work[1, i] = -n * turn + e * scale, e * turn + n * scale
+        _correct(s, h, east - e, north - n, a, b, d, share)
+    _judge(s, total)
+
+
+@compiled
+def _judge(s: Any, total: float) -> None:
+    """Let the weights, whose sum is ``total``, add up to one, and drop what does not count."""
     for h in range(s.hyp):
         s.hw[h] = s.hw[h] / total if total > 0.0 else 1.0 / s.hyp
     _prune(s)
@@ -200,6 +250,13 @@ def _innovation(s: Any, h: int, white: float) -> tuple[float, float, float]:
     return a, b, c
 
 
+@compiled
+def _place_gain(s: Any, h: int) -> None:
+    """Write P Hᵀ of a fix into ``work``: place and slow error add up to it."""
+    for i in range(N):
+        s.work[0, i], s.work[1, i] = s.hP[h, i, 0] + s.hP[h, i, 4], s.hP[h, i, 1] + s.hP[h, i, 5]
+
+
 @inlined
 def _density(x: float, y: float, a: float, b: float, c: float) -> float:
     det = a * c - b * b
@@ -208,21 +265,26 @@ def _density(x: float, y: float, a: float, b: float, c: float) -> float:
 
 
 @compiled
-def _likelihoods(s: Any, h: int, east: float, north: float, white: float) -> tuple[float, float]:
-    """Densities of a fix as inlier, and as outlier (the same with 50 m more an axis)."""
-    x, y = east - s.hx[h, 0] - s.hx[h, 4], north - s.hx[h, 1] - s.hx[h, 5]
-    a, b, c = _innovation(s, h, white)
-    return _density(x, y, a, b, c), _density(x, y, a + 2500.0, b, c + 2500.0) + 1e-30
+def _weigh(s: Any, h: int, x: float, y: float, a: float, b: float, c: float, more: float) -> float:
+    """Weigh a hypothesis by a residual (x, y) of covariance (a, b; b, c); return the inlier's share.
+
+    An outlier's residual has ``more`` variance an axis.
+    """
+    p_in = (1.0 - s.outlier) * _density(x, y, a, b, c)
+    p_out = s.outlier * (_density(x, y, a + more, b, c + more) + 1e-30)
+    s.hw[h] *= p_in + p_out
+    return p_in / (p_in + p_out)
 
 
 @compiled
-def _correct(s: Any, h: int, east: float, north: float, white: float, share: float) -> None:
-    """Kalman update by the inlier's share β: x + β K ν, P − β K S Kᵀ + β (1 − β) K ν νᵀ Kᵀ."""
-    x, y = east - s.hx[h, 0] - s.hx[h, 4], north - s.hx[h, 1] - s.hx[h, 5]
-    a, b, c = _innovation(s, h, white)
+def _correct(s: Any, h: int, x: float, y: float, a: float, b: float, c: float, share: float) -> None:
+    """Kalman update by the inlier's share β: x + β K ν, P − β K S Kᵀ + β (1 − β) K ν νᵀ Kᵀ.
+
+    ν = (x, y), S = (a, b; b, c), and ``work`` holds P Hᵀ by columns.
+    """
     det = a * c - b * b
     for i in range(N):
-        u, v = s.hP[h, i, 0] + s.hP[h, i, 4], s.hP[h, i, 1] + s.hP[h, i, 5]
+        u, v = s.work[0, i], s.work[1, i]
         s.work[0, i], s.work[1, i] = (u * c - v * b) / det, (v * a - u * b) / det
     for i in range(N):
         s.hx[h, i] += share * (s.work[0, i] * x + s.work[1, i] * y)

@@ -33,7 +33,15 @@ GYR = Input("gyr", "sensor_msgs/msg/Imu", ("gyr_x", "gyr_y", "gyr_z"), optional=
 MAG = Input("mag", "sensor_msgs/msg/MagneticField", ("mag_x", "mag_y", "mag_z"), optional=True, regular=True)
 PRESSURE = Input("pressure", "sensor_msgs/msg/FluidPressure", ("pressure_pa",), optional=True)
 GNSS = Input("gnss", "sensor_msgs/msg/NavSatFix", ALL_COLUMNS)
-ROLES = {"gyr": track.GYR, "acc": track.ACC, "mag": track.MAG, "pressure": track.PRESSURE, "gnss": track.GNSS}
+VELOCITY = Input("velocity", "geometry_msgs/msg/Vector3Stamped", ("vel_x", "vel_y"), optional=True)
+ROLES = {
+    "gyr": track.GYR,
+    "acc": track.ACC,
+    "mag": track.MAG,
+    "pressure": track.PRESSURE,
+    "gnss": track.GNSS,
+    "velocity": track.VELOCITY,
+}
 
 FIELD_ALONE = 3.0
 """Factor of a heading's deviations where no gyroscope smooths the field: sway, iron and tilt are in it."""
@@ -153,6 +161,15 @@ class PhoneFusedParams(PdrParams, frozen=True, forbid_unknown_fields=True, kw_on
         float, meta("Share of a fix's variance that changes slowly", "1", "ours", ge=0.0, lt=1.0)
     ] = 0.9
     gnss_tau_s: Annotated[float, meta("Correlation time of that share", "s", "ours", gt=0.0)] = 40.0
+    gnss_velocity_sd: Annotated[
+        float,
+        meta(
+            "Standard deviation an axis of the receiver's velocity (phones state 0.3 to 0.7 m/s of its size)",
+            "m/s",
+            "ours",
+            gt=0.0,
+        ),
+    ] = 0.3
     outlier: Annotated[float, meta("Probability that a fix is none", "1", "ours", gt=0.0, lt=0.5)] = 0.02
 
 
@@ -210,6 +227,7 @@ class PhoneTrack(KernelEstimator):
         if self.fused:
             s["gm_share"], s["gm_tau"], s["outlier"] = p.gnss_slow_share, p.gnss_tau_s, p.outlier
             s["sd_default"], s["sd_min"] = p.gnss_sd_m, p.gnss_sd_min_m
+            s["sd_velocity"] = p.gnss_velocity_sd
 
     def _calibrate(self, context: Context, s: Any) -> bool:
         """Write the calibrated field's strength into the state; return whether there is a calibration."""
@@ -437,6 +455,6 @@ class PhoneFused(PhoneTrack):
     title: ClassVar[str] = "steps, heading and GNSS fixes fused, causal"
     source: ClassVar[str] = "ours; data association: Bar-Shalom et al. 2009"
     Params = PhoneFusedParams
-    inputs = (GYR, ACC, MAG, PRESSURE, GNSS)
+    inputs = (GYR, ACC, MAG, PRESSURE, GNSS, VELOCITY)
     outputs = (STEP, POSE, SIGMA, HEADING, DETECTOR, STATE, FIX)
     fused: ClassVar[bool] = True

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from ..contract import ALL_COLUMNS, Context, FloatArray, IntArray, Message, PlainEstimator, Remark, Result
 from ..numerics.compiled import compiled
 from . import geodesy
-from .mixture import OTHER_SOURCE
+from .mixture import OTHER_SOURCE, VELOCITY_OUTLIER, VELOCITY_TAU_S
 from .pdr import FIX, POSE, SIGMA, STATE, PhoneFused, PhoneFusedParams, drift_sd
 from .steps import STEP
+from .track import PACE_S
 
 N = 7
 """East, north, heading correction, log scale, slow error of fixes (2), drift; as in :mod:`.mixture`."""
@@ -32,11 +33,15 @@ class WalkEvents(NamedTuple):
         Length (m) and heading (rad, from x to y) walked since the event before, (n, 2).
     fix : ndarray
         East, north (m) and standard deviation an axis (m); NaN at steps, (n, 3).
+    velocity : ndarray
+        Velocity of the receiver, east and north (m/s), NaN where it says none; that of the steps before
+        correction, and its mean square (m²/s²), as :func:`.mixture.velocity` takes them, (n, 5).
     """
 
     t_ns: IntArray
     move: FloatArray
     fix: FloatArray
+    velocity: FloatArray
 
 
 class Smoothed(NamedTuple):
@@ -97,6 +102,7 @@ def _pass(
 ) -> tuple[FloatArray, FloatArray]:
     """Return one linear smoother about ``ref``."""
     n = len(dt)
+    pulled = _velocity_noise(walk, ref, p)
     slow, anew = _sources(walk.fix[:, 2] * math.sqrt(p.gnss_slow_share))
     x = ref[0].copy()
     x[3:] = 0.0
@@ -122,6 +128,8 @@ def _pass(
             x = x + K @ (walk.fix[k, :2] - H @ x)
             A = np.eye(N) - K @ H
             P = A @ P @ A.T + K @ R @ K.T
+        if np.isfinite(pulled[k, 0]):
+            x, P = _pull(x, P, ref[k], walk.velocity[k], pulled[k])
         xs[k], Ps[k] = x, P
     for k in range(n - 2, -1, -1):
         G = np.linalg.solve(Pp[k + 1] + 1e-12 * np.eye(N), Fs[k + 1] @ Ps[k]).T
@@ -129,6 +137,49 @@ def _pass(
         Ps[k] = Ps[k] + G @ (Ps[k + 1] - Pp[k + 1]) @ G.T
         Ps[k] = (Ps[k] + Ps[k].T) / 2
     return xs, Ps
+
+
+def _velocity_noise(walk: WalkEvents, ref: FloatArray, p: PhoneFusedParams) -> FloatArray:
+    """Return residual (m/s) and variance an axis of the receiver's velocities at ``ref``, (n, 3); NaN at others.
+
+    The variance of a doubtful one is divided by its probability of being none that is wrong.
+    """
+    out = np.full((len(ref), 3), np.nan)
+    there = np.flatnonzero(np.isfinite(walk.velocity[:, 0]))
+    if not len(there):
+        return out
+    seen, steps = walk.velocity[there, :2], walk.velocity[there, 2:4]
+    c, w, k = np.cos(ref[there, 2]), np.sin(ref[there, 2]), np.exp(ref[there, 3])
+    walked = k[:, None] * np.column_stack(
+        (c * steps[:, 0] - w * steps[:, 1], w * steps[:, 0] + c * steps[:, 1])
+    )
+    apart = np.diff(walk.t_ns[there], prepend=walk.t_ns[0] - 10**10) * 1e-9
+    pace = (steps**2).sum(axis=1)
+    spread = max(p.sigma_length, math.radians(p.sigma_step_deg)) ** 2
+    variance = np.maximum(1.0, VELOCITY_TAU_S / np.maximum(apart, 0.1)) * p.gnss_velocity_sd**2
+    variance += k**2 * (np.maximum(walk.velocity[there, 4] - pace, 0.0) + 0.5 * spread * pace)
+    residual = seen - walked
+    size = (residual**2).sum(axis=1)
+    wide = variance + VELOCITY_OUTLIER**2
+    right = (1 - p.outlier) * np.exp(-0.5 * size / variance) / variance
+    wrong = p.outlier * np.exp(-0.5 * size / wide) / wide + 1e-300
+    out[there] = np.column_stack((residual, variance * (right + wrong) / np.maximum(right, 1e-300)))
+    return out
+
+
+def _pull(
+    x: FloatArray, P: FloatArray, ref: FloatArray, velocity: FloatArray, noise: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return state and covariance after a velocity of the receiver, linearized at ``ref``."""
+    c, w, k = math.cos(ref[2]), math.sin(ref[2]), math.exp(ref[3])
+    east, north = k * (c * velocity[2] - w * velocity[3]), k * (w * velocity[2] + c * velocity[3])
+    H = np.zeros((2, N))
+    H[:, 2], H[:, 3] = (-north, east), (east, north)
+    R = np.eye(2) * noise[2]
+    K = np.linalg.solve(H @ P @ H.T + R, H @ P).T
+    x = x + K @ (noise[:2] - H[:, 2:4] @ (x - ref)[2:4])
+    A = np.eye(N) - K @ H
+    return x, A @ P @ A.T + K @ R @ K.T
 
 
 def _sources(sd: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -206,6 +257,18 @@ def _density(r: FloatArray, S: FloatArray) -> float:
     return math.exp(-0.5 * float(r @ np.linalg.solve(S, r))) / (2 * math.pi * math.sqrt(np.linalg.det(S)))
 
 
+def _paces(starts: IntArray, ends: IntArray, length: FloatArray, heading: FloatArray) -> FloatArray:
+    """Return velocity of the steps, east and north, and its mean square, as the forward pass has it, (n, 3)."""
+    period = np.maximum((ends - starts) * 1e-9, 0.1)
+    rate = length / period
+    now = np.column_stack((rate * np.cos(heading), rate * np.sin(heading), rate * rate))
+    out = now.copy()
+    for k in range(1, len(ends)):
+        if (ends[k] - ends[k - 1]) * 1e-9 <= 2.0 * period[k] + PACE_S:
+            out[k] += math.exp(-period[k] / PACE_S) * (out[k - 1] - now[k])
+    return out
+
+
 @compiled
 def _plane(s: Any, lat: float, lon: float, alt: float) -> tuple[float, float, float]:
     return geodesy.to_enu(s, lat, lon, alt)
@@ -265,8 +328,8 @@ class PhoneSmooth(PlainEstimator):
         index = np.array([m[0] for m in self._messages])
         times = np.array([m[1] for m in self._messages], np.int64)
         values = np.full((len(times), 6), np.nan)
-        fixes = np.zeros((0, 5))
-        fix_times = times[:0]
+        fixes, velocities = np.zeros((0, 5)), np.zeros((0, 2))
+        fix_times = velocity_times = times[:0]
         for i, columns in self._columns.items():
             mine = np.flatnonzero(index == i)
             if not len(mine):
@@ -279,9 +342,11 @@ class PhoneSmooth(PlainEstimator):
             if self.inputs[i].name == "gnss":
                 good = np.isfinite(encoded[:, 0]) & np.isfinite(encoded[:, 1])
                 fixes, fix_times = encoded[good], times[mine][good]
+            elif self.inputs[i].name == "velocity":
+                velocities, velocity_times = encoded, times[mine]
         self._messages = []
         outputs = self._run(index, times, values)
-        return self._smoothed(outputs, fixes, fix_times)
+        return self._smoothed(outputs, fixes, fix_times, velocities, velocity_times)
 
     def _run(self, index: IntArray, times: IntArray, values: FloatArray) -> dict[str, list[tuple[int, Any]]]:
         """Run the forward pass; return its results by output."""
@@ -301,7 +366,12 @@ class PhoneSmooth(PlainEstimator):
         return out
 
     def _smoothed(
-        self, outputs: dict[str, list[tuple[int, Any]]], fixes: FloatArray, fix_times: IntArray
+        self,
+        outputs: dict[str, list[tuple[int, Any]]],
+        fixes: FloatArray,
+        fix_times: IntArray,
+        velocities: FloatArray,
+        velocity_times: IntArray,
     ) -> list[Result]:
         p, s = self.params, self._forward.state[0]
         if not len(fixes):
@@ -315,7 +385,7 @@ class PhoneSmooth(PlainEstimator):
         heading = np.array([v[4] - c[0] for _, v, c in steps])
         sd = np.where(fixes[:, 3] > 0, np.maximum(fixes[:, 3], p.gnss_sd_min_m), p.gnss_sd_m)
         place = np.array([_plane(s, a, b, s["alt_zero"])[:2] for a, b in fixes[:, :2].tolist()])
-        t_ns = np.unique(np.concatenate((ends, fix_times)))
+        t_ns = np.unique(np.concatenate((ends, fix_times, velocity_times)))
         walked = np.zeros((len(t_ns), 2))
         which = np.searchsorted(ends, t_ns)  # the step that ends at or after an event
         inside = which < len(ends)
@@ -329,7 +399,13 @@ class PhoneSmooth(PlainEstimator):
         seen[np.searchsorted(t_ns, fix_times)] = np.column_stack((place, sd))
         settled = [c[0] for _, _, c in steps[len(steps) // 2 :]] or [0.0]
         drift = math.atan2(np.mean(np.sin(settled)), np.mean(np.cos(settled)))
-        done = smooth(WalkEvents(t_ns, walked, seen), drift, self._noise)
+        beside = np.full((len(t_ns), 5), np.nan)
+        if len(ends):
+            step = np.minimum(np.searchsorted(ends, velocity_times), len(ends) - 1)
+            near = (velocity_times > starts[step] - 10**9) & (velocity_times < ends[step] + 10**9)
+            pace = _paces(starts, ends, length, heading)[step]
+            beside[np.searchsorted(t_ns, velocity_times[near])] = np.column_stack((velocities, pace))[near]
+        done = smooth(WalkEvents(t_ns, walked, seen, beside), drift, self._noise)
         if not np.isfinite(done.state).all():
             self._failed = "the smoother diverged"
             return []

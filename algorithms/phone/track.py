@@ -15,9 +15,11 @@ import numpy as np
 from ..numerics.compiled import compiled
 from . import attitude, direction, geodesy, lengths, mixture, ring, steps
 
-GYR, ACC, MAG, PRESSURE, GNSS = range(5)
+GYR, ACC, MAG, PRESSURE, GNSS, VELOCITY = range(6)
 """Roles of inputs."""
-WAITING = 32
+WAITING = 64
+PACE_S = 1.5
+"""Time over which the steps' velocity is averaged before a receiver's is laid beside it; it lags about so much."""
 EVENTS = 16
 """Steps and fixes that one message is answered with at most; what is more follows with the next."""
 
@@ -28,7 +30,7 @@ FIELDS: list[tuple[Any, ...]] = [
     *lengths.FIELDS,
     *geodesy.ORIGIN,
     *mixture.FIELDS,
-    ("role", "i8", (5,)),
+    ("role", "i8", (6,)),
     ("fused", "i8"),
     ("has_gyr", "i8"),
     ("mag_prior", "f8", (2,)),  # sigma and share of wrong of the first magnetic heading; 0 none
@@ -38,7 +40,19 @@ FIELDS: list[tuple[Any, ...]] = [
     ("distance", "f8"),
     ("waiting", "i8"),
     ("wait_ns", "i8", (WAITING,)),
-    ("wait", "f8", (WAITING, 5)),  # latitude, longitude (rad), height, deviation (m), declination (rad)
+    (
+        "wait",
+        "f8",
+        (WAITING, 5),
+    ),  # latitude, longitude (rad), height, deviation (m), declination (rad); velocity
+    ("wait_role", "i8", (WAITING,)),
+    ("sd_velocity", "f8"),
+    (
+        "pace",
+        "f8",
+        (3,),
+    ),  # velocity by steps and headings, east and north (m/s), and its mean square, over PACE_S
+    ("pace_ns", "i8"),
     ("part", "f8"),  # share of the first step in the queue that has been walked
     ("part_on", "i8"),
     ("part_length", "f8"),
@@ -93,8 +107,8 @@ def take(s: Any, role: int, t_ns: int, v: Any) -> None:
         if s.waiting >= WAITING:
             s.lost_fixes += 1
             return
-        s.wait_ns[s.waiting] = t_ns
-        for j in range(5):
+        s.wait_ns[s.waiting], s.wait_role[s.waiting] = t_ns, role
+        for j in range(5 if role == GNSS else 2):
             s.wait[s.waiting, j] = v[j]
         s.waiting += 1
 
@@ -210,9 +224,24 @@ def _write_track(s: Any, t_ns: int, cause: int, out_message: Any, out_t_ns: Any,
 
 
 @compiled
+def _walk(s: Any, t_ns: int, share: float) -> None:
+    """Go a share of the step that is open."""
+    mixture.step(s, t_ns, s.part_length, s.part_heading, share)
+    period = (s.queue_end[0] - s.queue_start[0]) * 1e-9
+    rate = s.part_length / max(period, 0.1)
+    keep = math.exp(-share * period / PACE_S)
+    if (t_ns - s.pace_ns) * 1e-9 > 2.0 * period + PACE_S:  # after a stand
+        keep = 0.0
+    s.pace[0] = keep * s.pace[0] + (1.0 - keep) * rate * math.cos(s.part_heading)
+    s.pace[1] = keep * s.pace[1] + (1.0 - keep) * rate * math.sin(s.part_heading)
+    s.pace[2] = keep * s.pace[2] + (1.0 - keep) * rate * rate
+    s.pace_ns = t_ns
+
+
+@compiled
 def _close_step(s: Any, cause: int, out_message: Any, out_t_ns: Any, out: Any, k: int) -> None:
     start, end = s.queue_start[0], s.queue_end[0]
-    mixture.step(s, end, s.part_length, s.part_heading, 1.0 - s.part)
+    _walk(s, end, 1.0 - s.part)
     length = s.part_length * math.exp(s.mean[3])
     s.distance += length
     if s.opposite > 0.0:
@@ -240,15 +269,30 @@ def _close_step(s: Any, cause: int, out_message: Any, out_t_ns: Any, out: Any, k
 
 
 @compiled
+def _drop_first(s: Any) -> None:
+    """Take the first one out of what waits."""
+    for k in range(1, s.waiting):
+        s.wait_ns[k - 1], s.wait_role[k - 1] = s.wait_ns[k], s.wait_role[k]
+        for j in range(5):
+            s.wait[k - 1, j] = s.wait[k, j]
+    s.waiting -= 1
+
+
+@compiled
+def _use_velocity(s: Any, t_ns: int) -> None:
+    """Take the first waiting velocity into the mixture; while nobody walks it says nothing of headings."""
+    east, north = s.wait[0, 0], s.wait[0, 1]
+    _drop_first(s)
+    if abs(t_ns - s.pace_ns) < 1_000_000_000 and s.pace[2] > 0.0 and s.first_step == 1:
+        mixture.velocity(s, t_ns, s.pace, east, north, s.sd_velocity)
+
+
+@compiled
 def _use_fix(s: Any, t_ns: int) -> None:
     """Take the first waiting fix into the mixture."""
     lat, lon, alt, sd = s.wait[0, 0], s.wait[0, 1], s.wait[0, 2], s.wait[0, 3]
     turn = s.wait[0, 4]
-    for k in range(1, s.waiting):
-        s.wait_ns[k - 1] = s.wait_ns[k]
-        for j in range(5):
-            s.wait[k - 1, j] = s.wait[k, j]
-    s.waiting -= 1
+    _drop_first(s)
     sd = max(sd, s.sd_min) if math.isfinite(sd) and sd > 0.0 else s.sd_default
     if s.origin_set == 0:
         geodesy.set_origin(s, lat, lon, alt if math.isfinite(alt) else 0.0)
@@ -287,6 +331,7 @@ def _decline(s: Any, turn: float) -> None:
         x, y = s.hx[h, 0], s.hx[h, 1]
         s.hx[h, 0], s.hx[h, 1] = c * x - w * y, w * x + c * y
     s.part_heading -= change
+    s.pace[0], s.pace[1] = c * s.pace[0] - w * s.pace[1], w * s.pace[0] + c * s.pace[1]
     for k in range(max(0, s.taken - ring.RING), s.taken):
         s.ring[k % ring.RING, ring.YAW] -= change
 
@@ -313,7 +358,7 @@ def drain(
                 t = s.wait_ns[0]
                 share = min(max((t - start) / max(end - start, 1), s.part), 1.0)
                 if share > s.part:
-                    mixture.step(s, t, s.part_length, s.part_heading, share - s.part)
+                    _walk(s, t, share - s.part)
                     s.part = share
             else:
                 if s.part < 1.0:
@@ -331,6 +376,9 @@ def drain(
         else:
             break
         t = s.wait_ns[0]
+        if s.wait_role[0] == VELOCITY:
+            _use_velocity(s, t)
+            continue
         _use_fix(s, t)
         _write_track(s, t, cause, out_message, out_t_ns, out, count)
         count, capacity = count + 1, capacity - 1

@@ -65,6 +65,8 @@ _OTHERS = (
     ("lon", re.compile(r"location longitude", re.IGNORECASE)),
     ("alt", re.compile(r"location altitude \(", re.IGNORECASE)),
     ("accuracy", re.compile(r"location accuracy", re.IGNORECASE)),
+    ("speed", re.compile(r"location speed \( ?kmh\)", re.IGNORECASE)),
+    ("course", re.compile(r"location orientation", re.IGNORECASE)),
     ("pressure", re.compile(r"(?:atmospheric )?pressure \(hpa\)", re.IGNORECASE)),
     ("ms", re.compile(r"time since start in ms", re.IGNORECASE)),
     ("wall", re.compile(r"yyyy-mo-dd", re.IGNORECASE)),
@@ -167,7 +169,8 @@ def _parts(path: Path, columns: dict[str, str]) -> list[StreamChannel]:
         source = {"pressure_pa": SourceColumn(columns["pressure"], HECTOPASCAL)}
         parts.append(StreamChannel("/phone/pressure", PRESSURE, source, held=True))
     if "lat" in columns and "lon" in columns:
-        parts.append(fix_part({k: columns[k] for k in ("lat", "lon", "alt", "accuracy") if k in columns}))
+        wanted = ("lat", "lon", "alt", "accuracy", "speed", "course")
+        parts.append(fix_part({k: columns[k] for k in wanted if k in columns}, speed_factor=1 / 3.6))
     if not parts:
         raise MarchaError(f"{path}: no sensor with its three axes in the header; nothing to convert")
     return parts

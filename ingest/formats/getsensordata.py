@@ -54,7 +54,7 @@ KINDS: dict[str, tuple[str, ...]] = {
     "MAGN": _AXES,
     "PRES": ("", "app", "t", "x"),
     "AHRS": ("", "app", "t", "", "", "", "x", "y", "z"),
-    "GNSS": ("", "app", "t", "lat", "lon", "alt", "", "accuracy"),
+    "GNSS": ("", "app", "t", "lat", "lon", "alt", "course", "accuracy", "speed"),
     "WIFI": ("", "app", "t", "", "mac", "rssi"),
     "BLE4": ("", "app", "", "mac", "rssi"),
     "BLUE": ("", "app", "", "mac", "rssi"),
@@ -85,11 +85,14 @@ _NAMES = (
     (r"lon", "lon"),
     (r"alt", "alt"),
     (r"accuracy\(m\)", "accuracy"),
+    (r"bearing", "course"),
+    (r"speed", "speed"),
     (r"mac", "mac"),
     (r"frequency", "frequency"),
     (r"rssi?(?:\(|$)", "rssi"),
 )
 """How the head names the columns that are read; without a name of ours the group is the axis."""
+_OPTIONAL = ("t", "alt", "accuracy", "course", "speed")
 _SAME_CLOCK_S = 0.5
 """Two clocks run alike where their difference varies less in a block."""
 
@@ -149,7 +152,7 @@ def _declared(head: bytes) -> dict[str, tuple[str, ...]]:
         columns = ["", *(_column(n) for n in text.split(";") if n.strip())]
         if kind not in ("WIFI", "BLE4", "BLUE", "GNSS") and "accuracy" in columns:
             columns[columns.index("accuracy")] = ""
-        if all(n in columns for n in KINDS[kind] if n and n not in ("t", "alt", "accuracy")):
+        if all(n in columns for n in KINDS[kind] if n and n not in _OPTIONAL):
             last = max(i for i, n in enumerate(columns) if n)
             columns_of[kind] = tuple(columns[: last + 1])
     return columns_of
@@ -179,7 +182,7 @@ def _stream(topic: str, report: ReportBuilder) -> Stream:
         "/phone/orientation": StreamChannel(
             topic, QUATERNION, _rotation, QUAT, metadata={"north": "magnetic"}
         ),
-        "/phone/gnss": fix_part({"lat": "lat", "lon": "lon", "alt": "alt", "accuracy": "accuracy"}),
+        "/phone/gnss": fix_part({k: k for k in ("lat", "lon", "alt", "accuracy", "speed", "course")}),
     }
     return Stream([parts[topic]], report, subject=topic, even=topic != "/phone/gnss")
 

@@ -55,6 +55,10 @@ _FIX = {
     "accuracy": "accuracy",
     "accuracymeters": "accuracy",
     "verticalaccuracymeters": "vertical",
+    "speed": "speed",
+    "speedmps": "speed",
+    "bearing": "course",
+    "bearingdegrees": "course",
     "(utc)timeinms": "t",
     "unixtimemillis": "t",
     "provider": "provider",
@@ -91,7 +95,8 @@ class GnssLogger:
         for kind in sorted(there):
             names = columns[kind]
             if kind == "Fix":
-                part = fix_part({k: k for k in ("lat", "lon", "alt", "accuracy", "vertical") if k in names})
+                wanted = ("lat", "lon", "alt", "accuracy", "vertical", "speed", "course")
+                part = fix_part({k: k for k in wanted if k in names})
                 streams[kind] = Stream([part], report, subject="fixes", even=False, attachments=attachments)
                 continue
             if kind == _ORIENTATION:

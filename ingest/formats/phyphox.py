@@ -58,6 +58,8 @@ _FIX = {
     "altitude": "alt",
     "horizontal accuracy": "accuracy",
     "vertical accuracy": "vertical",
+    "velocity": "speed",
+    "direction": "course",
 }
 _SPREADSHEET = (["timestamps", "x", "y", "z"], ["timestamps", "lat", "lon"])
 _LATE_S = 0.5

@@ -55,7 +55,7 @@ _TRIPLES = READ[:8]
 _TEXT = ("sensor", "name", "text", "standardisation")
 _NUMBERS = {
     "time", "seconds_elapsed", "x", "y", "z", "latitude", "longitude", "altitude", "horizontalAccuracy",
-    "verticalAccuracy", "pressure", "steps", "qw", "qx", "qy", "qz",
+    "verticalAccuracy", "speed", "bearing", "pressure", "steps", "qw", "qx", "qy", "qz",
 }  # fmt: skip
 """Columns that are read; others may be text, as the times for people that the app writes if told to."""
 _Q = ("qw", "qx", "qy", "qz")
@@ -289,7 +289,7 @@ def _streams(
     if name is not None:
         wanted = {
             "lat": "latitude", "lon": "longitude", "alt": "altitude",
-            "accuracy": "horizontalAccuracy", "vertical": "verticalAccuracy",
+            "accuracy": "horizontalAccuracy", "vertical": "verticalAccuracy", "speed": "speed", "course": "bearing",
         }  # fmt: skip
         columns = {k: v for k, v in wanted.items() if v in tables[name].columns}
         if "lat" in columns and "lon" in columns:

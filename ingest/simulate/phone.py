@@ -92,6 +92,8 @@ class PhoneOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     gnss_hz, gnss_sigma_m, gnss_tau_s, gnss_noise_m, gnss_alt_factor : float
         Rate of the fixes; standard deviation an axis (m) and correlation time (s) of their slow error; that
         of the white one (m); how much worse heights are.
+    gnss_velocity_sigma : float
+        Standard deviation an axis of the receiver's velocity (m/s), which some apps log.
     gnss_loss : tuple of (float, float)
         Start and length (s after the first sample) of losses of signal.
     gnss_outliers : tuple of (float, float)
@@ -128,6 +130,7 @@ class PhoneOptions(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fie
     gnss_tau_s: _Positive = 40.0
     gnss_noise_m: _NonNegative = 0.8
     gnss_alt_factor: _Positive = 1.6
+    gnss_velocity_sigma: _NonNegative = 0.3
     gnss_loss: tuple[Interval, ...] = ()
     gnss_outliers: tuple[Interval, ...] = ()
     pressure_hz: Annotated[float, msgspec.Meta(ge=0, le=200)] = 5.0
@@ -160,7 +163,7 @@ class PhoneWalk:
         One row a step in the columns of ``marcha_msgs/msg/Step``: it ends with the contact of the foot.
     fixes : polars.DataFrame
         ``t_ns, lat_deg, lon_deg, alt_m, sd_east_m, sd_north_m, sd_up_m`` as the phone states them, and
-        ``east_m, north_m, up_m``: where it was in truth.
+        ``east_m, north_m, up_m``: where it was in truth; ``vel_east, vel_north``: the receiver's velocity (m/s).
     pressure : polars.DataFrame
         ``t_ns, pressure_pa``.
     closed, length_m : bool, float
@@ -294,7 +297,7 @@ def phone_walk(scenario: str = "phone-turns", *, seed: int = 0, **options: Any) 
     mag_b, hard = _magnetometer(mag, o, ideal, rng("mag"))
 
     t_ns = start_ns + np.round(t * 1e9).astype(np.int64)
-    fixes = fixes_of(walker, o, start_ns, plan.end_s, rng("gnss"))
+    fixes = fixes_of(walker, o, start_ns, plan.end_s, rng("gnss"), rng("gnss velocity"))
     return PhoneWalk(
         t_ns=t_ns,
         acc_b=measured[:, :3],

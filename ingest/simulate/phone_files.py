@@ -99,19 +99,24 @@ def _phyphox(path: Path, walk: PhoneWalk) -> None:
         header = ['"Time (s)"', *(f'"{a} ({unit})"' for a in "XYZ")]
         _csv(path / f"{name}.csv", header, [t, *values.T])
     f = walk.fixes
-    none = np.full(f.height, -1.0)
     names = ["Time (s)", "Latitude (°)", "Longitude (°)", "Height (m)", "Velocity (m/s)", "Direction (°)"]
     names += ["Horizontal Accuracy (m)", "Vertical Accuracy (m)"]
     columns = [
         (f["t_ns"].to_numpy() - start) / 1e9,
         *(f[c].to_numpy() for c in ("lat_deg", "lon_deg", "alt_m")),
     ]
-    columns += [none, none, f["sd_east_m"].to_numpy() * RADIAL_68, f["sd_up_m"].to_numpy()]
+    columns += [*_speed_and_course(walk), f["sd_east_m"].to_numpy() * RADIAL_68, f["sd_up_m"].to_numpy()]
     _csv(path / "Location.csv", [f'"{n}"' for n in names], columns)
     p = walk.pressure
     if p.height:
         seconds = (p["t_ns"].to_numpy() - start) / 1e9
         _csv(path / "Pressure.csv", ['"Time (s)"', '"X (hPa)"'], [seconds, p["pressure_pa"].to_numpy() / 100])
+
+
+def _speed_and_course(walk: PhoneWalk) -> tuple[np.ndarray, np.ndarray]:
+    """Return size (m/s) and course (degrees clockwise from north) of the receiver's velocity at the fixes."""
+    east, north = (walk.fixes[c].to_numpy() for c in ("vel_east", "vel_north"))
+    return np.hypot(east, north), np.degrees(np.arctan2(east, north)) % 360
 
 
 def _sensor_logger(path: Path, walk: PhoneWalk) -> None:
@@ -128,8 +133,16 @@ def _sensor_logger(path: Path, walk: PhoneWalk) -> None:
     ):
         write(name, ["z", "y", "x"], walk.t_ns, list(values[:, ::-1].T))
     f = walk.fixes
-    names = ["verticalAccuracy", "horizontalAccuracy", "altitude", "longitude", "latitude"]
-    columns = [f["sd_up_m"].to_numpy(), f["sd_east_m"].to_numpy() * RADIAL_68]
+    names = [
+        "speed",
+        "bearing",
+        "verticalAccuracy",
+        "horizontalAccuracy",
+        "altitude",
+        "longitude",
+        "latitude",
+    ]
+    columns = [*_speed_and_course(walk), f["sd_up_m"].to_numpy(), f["sd_east_m"].to_numpy() * RADIAL_68]
     columns += [f[c].to_numpy() for c in ("alt_m", "lon_deg", "lat_deg")]
     write("Location", names, f["t_ns"].to_numpy(), columns)
     if walk.pressure.height:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from .gait import FloatArray
 from .phone_motion import Phone, Schedule, Walker
@@ -63,7 +64,12 @@ def magnetic_disturbance(
 
 
 def fixes_of(
-    walker: Walker, o: PhoneOptions, start_ns: int, end_s: float, rng: np.random.Generator
+    walker: Walker,
+    o: PhoneOptions,
+    start_ns: int,
+    end_s: float,
+    rng: np.random.Generator,
+    velocity_rng: np.random.Generator,
 ) -> pl.DataFrame:
     """Return the fixes: truth, a slow first-order Gauss-Markov error and a white one, losses, outliers."""
     from scipy.signal import lfilter
@@ -101,7 +107,19 @@ def fixes_of(
             "north_m": truth[~lost, 1],
             "up_m": truth[~lost, 2],
         }
+        | _velocities(walker, o, t, velocity_rng, ~lost)
     )
+
+
+def _velocities(
+    walker: Walker, o: PhoneOptions, t: FloatArray, rng: np.random.Generator, kept: NDArray[np.bool_]
+) -> dict[str, FloatArray]:
+    """Return the receiver's velocity (m/s): the mean over the second before, with a white error."""
+    if not len(t):
+        return {"vel_east": t, "vel_north": t}
+    mean = walker.ground(t)[:, :2] - walker.ground(np.maximum(t - 1.0, 0.0))[:, :2]
+    error = o.gnss_velocity_sigma * rng.standard_normal((len(t), 2))
+    return dict(zip(("vel_east", "vel_north"), (mean + error)[kept].T, strict=True))
 
 
 def geodetic(o: PhoneOptions, place: FloatArray) -> tuple[FloatArray, FloatArray]:

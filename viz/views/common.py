@@ -205,7 +205,9 @@ class Velocity(View):
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
         values = columns_of(block, self.names)
         self.canvas.scalars(self.path, t_ns, values)
-        self.canvas.scalars(self.speed, t_ns, np.sqrt(np.einsum("ij,ij->i", values, values)))
+        speed = np.sqrt(np.nansum(values * values, axis=1))  # a receiver's velocity has no vertical part
+        speed[np.isnan(values).all(axis=1)] = np.nan
+        self.canvas.scalars(self.speed, t_ns, speed)
 
 
 class Values(View):
