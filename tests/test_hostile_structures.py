@@ -309,17 +309,35 @@ def test_a_table_that_lacks_an_axis_is_left_out_and_counted(tmp_path: Path) -> N
     assert finding.count == len(lines) - 1
 
 
-@pytest.mark.parametrize("number", ["9" * 400, "null", '"x"'])
-def test_a_receiver_at_no_place_is_one_line(tmp_path: Path, number: str) -> None:
+@pytest.mark.parametrize("numbers", ["9" * 400 + ",", "null,", '"x",', ""], ids=lambda t: t[:5])
+def test_a_receiver_at_no_place_is_one_line(tmp_path: Path, numbers: str) -> None:
     from .test_import_ble_mbd import TestBleMbd
 
     log = TestBleMbd().sample(tmp_path)
     (table,) = tmp_path.rglob("*.dev")
     said = table.read_text()
-    table.write_text(re.sub(r"\[\[\s*-?[\d.]+", f"[[{number}", said, count=1))
+    table.write_text(re.sub(r"\[\[\s*-?[\d.]+,", f"[[{numbers}", said, count=1))
     assert table.read_text() != said
     with pytest.raises(MarchaError, match="not \\[\\[x, y, z\\]"):
         convert(log, tmp_path / "out.mcap", format="ble-mbd")
+
+
+@pytest.mark.parametrize("rate", ["..", "50.0.1", ".", "9" * 400, "0"], ids=lambda t: t[:6])
+def test_a_rate_that_is_none_is_one_line(tmp_path: Path, rate: str) -> None:
+    from .test_import_leg_formats import TestSegmentsCsv, TestXsensText
+
+    for contract, format, unit in (
+        (TestSegmentsCsv, "segments-csv", ""),
+        (TestXsensText, "xsens-text", "Hz"),
+    ):
+        log = contract().sample(tmp_path)
+        said = log.read_text()
+        log.write_text(re.sub(rf"(ency|Rate): 50(\.0)?{unit}", rf"\1: {rate}{unit}", said, count=1))
+        assert log.read_text() != said
+        with pytest.raises(MarchaError) as error:
+            convert(log, tmp_path / "out.mcap", format=format)
+        assert len(str(error.value)) < 400
+        assert not (tmp_path / "out.mcap").exists()
 
 
 def test_an_anchor_table_with_returns_inside_is_read_by_lines() -> None:

@@ -258,7 +258,8 @@ def _devices(file: Path) -> dict[str, tuple[list[float], str]]:
     devices: dict[str, tuple[list[float], str]] = {}
     for mac, about in table.items():
         try:
-            devices[address(mac)] = ([float(v) for v in about[0][:3]], str(about[2]))
+            x, y, z = map(float, about[0][:3])
+            devices[address(mac)] = ([x, y, z], str(about[2]))
         except (TypeError, ValueError, IndexError, KeyError, OverflowError) as error:
             raise MarchaError(f"{file}: receiver {mac}: not [[x, y, z], colour, name]") from error
     return devices

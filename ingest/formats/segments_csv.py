@@ -33,7 +33,7 @@ from ..orientations import OrientationOptions, with_angles
 from ..text import read_blocks
 from .table import open_table
 
-_RATE = re.compile(rb"^#\s*sampling frequency:\s*([\d.]+)", re.MULTILINE)
+_RATE = re.compile(rb"^#\s*sampling frequency:\s*(\d{1,9}(?:\.\d*)?)(?![\d.])", re.MULTILINE)
 _UNITS = re.compile(rb"^#\s*units are\s*([^\r\n]+)", re.MULTILINE)
 _COLUMN = re.compile(
     r"(?P<segment>.+?)_(?:(?P<kind>acc|gyr|mag|quat)|(?P<marker>marker\w*))_(?P<axis>[wxyz])"

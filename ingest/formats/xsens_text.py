@@ -45,7 +45,7 @@ QUATERNIONS = (
     ("q0", "q1", "q2", "q3"),
 )
 EULER = ("Roll", "Pitch", "Yaw")
-_RATE = re.compile(r"^//\s*(?:Update Rate|Sample rate)\s*:\s*([\d.]+)\s*Hz", re.IGNORECASE)
+_RATE = re.compile(r"^//\s*(?:Update Rate|Sample rate)\s*:\s*(\d{1,9}(?:\.\d*)?)\s*Hz", re.IGNORECASE)
 
 
 class XsensOptions(OrientationOptions, frozen=True, kw_only=True):

@@ -5,9 +5,11 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass
+from functools import lru_cache
 from io import BytesIO
 
 import lz4.frame
+import numpy as np
 import zstandard
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
@@ -390,8 +392,7 @@ def _m(items: dict[str, str]) -> bytes:
 
 def odd(rng: Rng, data: bytes) -> bytes:
     """Return a sound recording with odd contents, written by mcap's own library from what ``data`` holds."""
-    parts = records(data)
-    out = BytesIO()
+    parts, out = records(data), BytesIO()
     packing = pick(rng, (CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE))
     writer = Writer(
         out,
@@ -421,27 +422,26 @@ def odd(rng: Rng, data: bytes) -> bytes:
     extra = _own_channels(rng, writer)
     share, shift = float(rng.choice([1.0, 0.3, 0.02])), int(rng.choice([0, 0, 10**18, 2**62, -(10**15)]))
     first = None
-    for part in parts:
-        if part.opcode != Opcode.CHUNK:
-            continue
-        for message in records(_unpacked(part.body)[1], 0):
-            if message.opcode != Opcode.MESSAGE or rng.random() > share:
-                continue
-            channel, sequence, log, publish = struct.unpack_from("<HIQQ", message.body)
-            first = log if first is None else first
-            log, publish = (max(0, t - first + shift if shift < 0 else t + shift) for t in (log, publish))
-            if rng.random() < 0.02:
-                publish = int(pick(rng, (0, log, 2**63, 2**64 - 1)))
-            body = bytearray(message.body[22:])
-            if rng.random() < 0.02 and len(body) > 60:
-                at = int(rng.integers(40, len(body) - 8)) // 8 * 8 + 4
-                body[at : at + 8] = struct.pack(
-                    "<d", float(pick(rng, (float("nan"), float("inf"), 1e308, -1e308, 5e-324)))
-                )
-            writer.add_message(channels.get(channel, 1), log, bytes(body), publish, sequence)
-            for other, payload in extra:
-                if rng.random() < 0.01:
-                    writer.add_message(other, log, payload, publish)
+    messages = _messages(data)
+    taken = rng.random(len(messages)) <= share
+    for k in np.flatnonzero(taken).tolist():
+        channel, sequence, log, publish, content = messages[k]
+        first = log if first is None else first
+        log, publish = (max(0, t - first + shift if shift < 0 else t + shift) for t in (log, publish))
+        odds = rng.random(2)
+        if odds[0] < 0.02:
+            publish = int(pick(rng, (0, log, 2**63, 2**64 - 1)))
+        if odds[1] < 0.02 and len(content) > 60:
+            body = bytearray(content)
+            at = int(rng.integers(40, len(body) - 8)) // 8 * 8 + 4
+            body[at : at + 8] = struct.pack(
+                "<d", float(pick(rng, (float("nan"), float("inf"), 1e308, -1e308, 5e-324)))
+            )
+            content = bytes(body)
+        writer.add_message(channels.get(channel, 1), log, content, publish, sequence)
+        for other, payload in extra:
+            if rng.random() < 0.01:
+                writer.add_message(other, log, payload, publish)
     for _ in range(int(rng.integers(0, 4))):
         writer.add_metadata(
             str(pick(rng, ("truth", "device", "x", "run/a", "\x1b[1m"))),
@@ -456,6 +456,18 @@ def odd(rng: Rng, data: bytes) -> bytes:
         )
     writer.finish()
     return out.getvalue()
+
+
+@lru_cache(16)
+def _messages(data: bytes) -> list[tuple[int, int, int, int, bytes]]:
+    """Return channel, sequence, both times (ns) and content of every message of a sound file."""
+    return [
+        (*struct.unpack_from("<HIQQ", message.body), message.body[22:])
+        for chunk in records(data)
+        if chunk.opcode == Opcode.CHUNK
+        for message in records(_unpacked(chunk.body)[1], 0)
+        if message.opcode == Opcode.MESSAGE
+    ]
 
 
 def _own_channels(rng: Rng, writer: Writer) -> list[tuple[int, bytes]]:

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 WARM = 4
 """Most inputs of each target that run before all others, so that what they need is loaded once."""
 
-TOGETHER = 64
-"""Inputs of one target that run in one process."""
+TOGETHER = 256
+"""Inputs of one target that run in one process, which loads what draws (a second) anew."""
 FEW = 1000
 """Inputs up to which all targets have as many: a run of so few is the same on every machine."""
 MOST_TURNS = 12

@@ -31,7 +31,7 @@ from marcha.recording.scratch import remove_left
 CPU_S = 5
 """Processor time of one input; a hang by the clock is six times that, since other work may hold the machine."""
 MEMORY_BYTES = 500_000_000
-"""What one input may take beside what the process has when it begins."""
+"""What one input may take beside what the process has when that input begins."""
 THREADED = ("rerun", "marcha.viz", "marcha.study", "__main__", "__mp_")
 """Modules that start threads when they are imported, which do not live on in a forked process, or that use those."""
 _REGISTRIES = (
@@ -165,10 +165,10 @@ def _be_child(tasks: Sequence[Callable[[], Any]], writer: int, cpu_s: float, mem
     os.setpgid(0, 0)
     faulthandler.disable()  # a crash is told by its signal
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    before = _resident()
-    _limit_data(3 * memory)
     with os.fdopen(writer, "wb") as out:
         for task in tasks:
+            # From here on, for each: what those before it loaded and kept is not what this one takes.
+            before = _begin_memory(3 * memory)
             began = time.process_time()
             resource.setrlimit(resource.RLIMIT_CPU, (int(began) + max(1, int(cpu_s)), resource.RLIM_INFINITY))
             result, kind, detail = None, "", ""
@@ -180,7 +180,7 @@ def _be_child(tasks: Sequence[Callable[[], Any]], writer: int, cpu_s: float, mem
                 kind, detail = "memory", traceback.format_exc(limit=-3)
             except BaseException:
                 kind, detail = "traceback", traceback.format_exc(limit=-6)
-            grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
+            grown = _peak() - before
             if not kind and grown > memory:
                 kind, detail = "memory", f"{grown / 1e6:.0f} MB"
             pickle.dump(_Word(result, kind, detail, time.process_time() - began)[:], out)
@@ -190,22 +190,31 @@ def _be_child(tasks: Sequence[Callable[[], Any]], writer: int, cpu_s: float, mem
     os._exit(0)
 
 
-def _resident() -> int:
+def _begin_memory(more: int) -> int:
+    """Forget the peak of before, let the process take so many bytes more, and return what it has now.
+
+    What takes too much must not take the machine's memory.
+    """
     try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, ValueError):
+        Path("/proc/self/clear_refs").write_text("5")
+        data = _status("VmData") + more
+    except (OSError, IndexError, ValueError):
+        return _peak()
+    with contextlib.suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_DATA, (data, resource.RLIM_INFINITY))
+    return _peak()
+
+
+def _peak() -> int:
+    """Return the most bytes that were resident since the peak was forgotten, or ever where it cannot be."""
+    try:
+        return _status("VmHWM")
+    except (OSError, IndexError, ValueError):
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
-def _limit_data(more: int) -> None:
-    """Let the process take so many bytes more: what takes too much must not take the machine's."""
-    try:
-        text = Path("/proc/self/status").read_text()
-        now = int(text.split("VmData:")[1].split()[0]) * 1024
-    except (OSError, IndexError, ValueError):
-        return
-    with contextlib.suppress(ValueError, OSError):
-        resource.setrlimit(resource.RLIMIT_DATA, (now + more, now + more))
+def _status(name: str) -> int:
+    return int(Path("/proc/self/status").read_text().split(f"{name}:")[1].split()[0]) * 1024
 
 
 # -- loading once ------------------------------------------------------------------------------------------
