@@ -18,6 +18,8 @@ from .clockfit import ClockFit, FloatArray, Pair, from_events, from_rates, state
 from .leg import JOINTS, MARKERS_TOPIC, marker_names
 
 GYR = ("gyr_x", "gyr_y", "gyr_z")
+FASTEST_RAD_S = 1e4
+"""No sensor of a limb turns faster: a damaged number."""
 
 
 def align(
@@ -203,7 +205,7 @@ def _about_main_axis(table: pl.DataFrame, t: FloatArray) -> FloatArray:
     """Return the rate about its main axis (n,), at times ``t``."""
     gyr = table.select(GYR).to_numpy()
     gyr = gyr - np.nanmedian(gyr, axis=0)
-    good = np.isfinite(gyr).all(axis=1)
+    good = (np.abs(gyr) < FASTEST_RAD_S).all(axis=1)
     axis = np.linalg.eigh(gyr[good].T @ gyr[good])[1][:, 2]
     return np.interp(t, table["t_ns"].to_numpy()[good] * 1e-9, gyr[good] @ axis)
 

@@ -33,6 +33,8 @@ FloatArray = NDArray[np.float64]
 SIDES = ("left", "right")
 JOINTS = {"hip": ("trunk", "thigh"), "knee": ("thigh", "shank"), "ankle": ("shank", "foot")}
 """Joints: upper and lower segment."""
+FARTHEST_M = 1e6
+"""A marker farther than this from the origin of its room is none."""
 STATIC_S = 1.0
 """Stretch at the start whose mean pose is zero where nothing else says it."""
 RIGID_M = 0.02
@@ -182,14 +184,16 @@ def cluster_attitude(pos: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
     Parameters
     ----------
     pos : ndarray, shape (n, markers, 3)
-        NaN where a marker is hidden. Frames with fewer than three seen have no attitude.
+        NaN where a marker is hidden; one farther than :data:`FARTHEST_M` is taken for hidden. Frames with fewer
+        than three seen have no attitude.
 
     Returns
     -------
     rot, place, shape, misfit : ndarray (n, 3, 3), (n, 3), (markers, 3), float
         ``pos = place + rot @ shape``; NaN where not known; misfit in m (rms), NaN without a whole frame.
     """
-    seen = np.asarray(np.isfinite(pos).all(axis=2))
+    # LAPACK may work for ever on what overflowed.
+    seen = np.asarray((np.abs(pos) < FARTHEST_M).all(axis=2))
     n, m = pos.shape[:2]
     lost = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan), np.full((m, 3), np.nan), float("nan")
     whole = np.flatnonzero(seen.all(axis=1))

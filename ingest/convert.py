@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
+import numpy as np
 import polars as pl
 
 from .. import recording as mr
@@ -125,6 +126,8 @@ def convert(
     if out.exists() and not overwrite:
         raise OutputExists(out)
     with contextlib.ExitStack() as stack:
+        # A damaged number of 1e308 overflows where it is squared: what compares it then says no, as it should.
+        stack.enter_context(np.errstate(over="ignore", invalid="ignore"))
         recognised = registry.choose(
             sources, format, stack, mapped=mapped, unpack_limit_gb=unpack_limit(options or {})
         )

@@ -144,7 +144,7 @@ def _handed(topic: str, sensor: _Sensor, report: ReportBuilder) -> None:
     a, w = acc[size:-size], gyr[size:-size]
     quiet = np.abs(np.linalg.norm(a, axis=1) - 9.8) < 1.5
     even = np.abs(span - 2 * size * sensor.step) < sensor.step
-    good = quiet & even & np.isfinite(slope).all(axis=1) & np.isfinite(w).all(axis=1)
+    good = quiet & even & np.isfinite(slope).all(axis=1) & (np.abs(w) < 1e4).all(axis=1)
     if good.sum() < 200:
         return
     slope, a, w = slope[good], a[good], w[good] - np.median(w[good], axis=0)

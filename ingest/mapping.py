@@ -12,6 +12,7 @@ from ..recording import SCHEMAS
 from ..recording.errors import MarchaError, UsageError
 from ..recording.files import read_toml
 from ..recording.schemas import Column
+from .timestamps import Rate
 from .units import conversion
 
 TICKS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "µs": 1_000, "ns": 1}
@@ -78,7 +79,7 @@ class Time(Strict, frozen=True, kw_only=True):
     column: str | int | None = None
     unit: Literal["s", "ms", "us", "µs", "ns", "datetime"] = "s"
     format: str | None = None
-    rate_hz: Annotated[float, msgspec.Meta(gt=0)] | None = None
+    rate_hz: Rate | None = None
     clock: Literal["device", "unix", "utc"] = "device"
     rollover: Annotated[int, msgspec.Meta(gt=0)] | None = None
     even: bool = True

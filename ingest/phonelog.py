@@ -7,6 +7,7 @@ standard deviations. What was converted stands in the metadata record ``device``
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,7 +23,7 @@ from .fixes import finished_fixes, velocities, velocity_spec
 from .inertial import ACC, GYR, IMU, MAG, Plateau, SourceColumn
 from .inertial import FIELD as FIELD
 from .radio import without_stale
-from .timestamps import TimestampRepair
+from .timestamps import TimestampRepair, nanoseconds
 
 FIX = "sensor_msgs/msg/NavSatFix"
 PRESSURE = "sensor_msgs/msg/FluidPressure"
@@ -138,7 +139,7 @@ def rotation_vector(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> dict[str, np
 
 def whole_ns(values: pl.Series, per_microsecond: float) -> pl.Series:
     """Return times as whole ns, exact to the µs: ``values`` times ``per_microsecond`` are microseconds."""
-    return pl.Series(np.round(values.to_numpy() * per_microsecond).astype(np.int64) * 1000)
+    return pl.Series(nanoseconds(values, per_microsecond, tick_ns=1000))
 
 
 def _velocity(part: StreamChannel) -> list[ChannelSpec]:
@@ -352,7 +353,8 @@ class _Check:
         self._plateau.feed(list(values.values()), lines)
         if len(acc) == 3 and not self._judged:
             self._judged = True
-            middle = float(np.nanmedian(np.sqrt(acc[0] ** 2 + acc[1] ** 2 + acc[2] ** 2)))
+            norm = np.sqrt(acc[0] ** 2 + acc[1] ** 2 + acc[2] ** 2)
+            middle = float(np.median(norm[~np.isnan(norm)])) if not np.isnan(norm).all() else math.nan
             if middle < NO_GRAVITY and not 0.9 < middle < 1.1:
                 self._report.loss(
                     "gravity_free",

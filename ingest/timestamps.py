@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Annotated
 
+import msgspec
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from ..recording import MarchaError
 from .contract import ReportBuilder
 
 Int64Array = NDArray[np.int64]
 
 #: Times beyond this (ns) would not fit 64 bits where a clock is moved: what reads them leaves their rows out.
 MOST_NS = 4 * 10**18
+#: What stands for such a time (ns), so that it is not taken for another.
+FAR_NS = 2 * MOST_NS
+#: Rates that a file or a user may state (Hz): with others, times of rows overflow or are all the same.
+RATES_HZ = (1e-3, 1e7)
+Rate = Annotated[float, msgspec.Meta(ge=RATES_HZ[0], le=RATES_HZ[1])]
 #: A run of fewer rows whose time stands back is a slip of those rows; a longer one is a clock set anew.
 SLIP_ROWS = 20
 #: Intervals longer than this many nominal ones miss a row; longer than LONG_GAP ones, the source lost data.
@@ -24,6 +33,43 @@ JITTER = 0.1
 BURSTY = 0.92
 #: A counter that wraps goes on within this time of its last value; anything else is a step back.
 ROLLOVER_S = 3600.0
+
+
+def nanoseconds(
+    values: ArrayLike, factor: float, origin: int | Int64Array = 0, tick_ns: int = 1
+) -> Int64Array:
+    """Return whole nanoseconds; :data:`FAR_NS` where no clock can say the time, or where there is none.
+
+    Parameters
+    ----------
+    values : array_like of float, (n,)
+        Times in any unit.
+    factor : float
+        Ticks in that unit, to which times are rounded.
+    origin : int or array of int, (n,)
+        Time (ns) at zero.
+    tick_ns : int
+        Nanoseconds of a tick.
+    """
+    ticks = np.rint(np.asarray(values, np.float64) * factor)
+    possible = np.abs(ticks) <= MOST_NS // tick_ns
+    return np.where(possible, origin + np.where(possible, ticks, 0.0).astype(np.int64) * tick_ns, FAR_NS)
+
+
+def possible_rate(rate_hz: float, path: Path, remedy: str) -> float:
+    """Return a rate that a file states, or refuse it.
+
+    Raises
+    ------
+    MarchaError
+        It is not within :data:`RATES_HZ`.
+    """
+    low, high = RATES_HZ
+    if not low <= rate_hz <= high:
+        raise MarchaError(
+            f"{path}: {rate_hz:g} Hz is the rate of no sensor ({low:g} to {high:g} Hz); {remedy}"
+        )
+    return rate_hz
 
 
 class TimestampRepair:

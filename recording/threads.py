@@ -8,6 +8,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextvars import copy_context
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -41,7 +42,14 @@ def helpers(name: str, most: int = 4) -> Executor:
     """
     if most == 0 or threads() == 1:
         return _InlineExecutor()
-    return ThreadPoolExecutor(min(most, threads()), thread_name_prefix=f"marcha-{name}")
+    return _Pool(min(most, threads()), thread_name_prefix=f"marcha-{name}")
+
+
+class _Pool(ThreadPoolExecutor):
+    """Does everything in the caller's context: what it says of NumPy's warnings holds in the threads too."""
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        return super().submit(copy_context().run, fn, *args, **kwargs)
 
 
 class _InlineExecutor(Executor):

@@ -126,6 +126,8 @@ def align(
     cross = (reference - centre_r).T @ (estimate - centre_e)
     if kind in ("se2", "sim2"):
         rotation = about_z(float(np.arctan2(cross[1, 0] - cross[0, 1], cross[0, 0] + cross[1, 1])))
+    elif not np.isfinite(cross).all():  # LAPACK may work for ever on what overflowed
+        rotation = np.full((3, 3), np.nan)
     else:
         u, _, vt = np.linalg.svd(cross)
         rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))]) @ vt

@@ -15,7 +15,7 @@ import pytest
 from marcha.export import export
 from marcha.export.labels import read_labels
 from marcha.ingest import convert
-from marcha.ingest.anatomy import frame
+from marcha.ingest.anatomy import cluster_attitude, frame
 from marcha.ingest.contract import SourceAttachment
 from marcha.ingest.radio import addresses
 from marcha.ingest.workbook import MOST_CELLS, read_workbook
@@ -344,6 +344,17 @@ def test_an_anchor_table_with_returns_inside_is_read_by_lines() -> None:
     table = b"name,mac,x_m,y_m\na,00:00:00:00:00:01,0,0\rb,00:00:00:00:00:02,1,1\n"
     found = addresses([SourceAttachment("anchors.csv", table, "text/csv")])
     assert found == ["00:00:00:00:00:01", "00:00:00:00:00:02"]
+
+
+def test_a_marker_beyond_any_room_is_not_looked_for_endlessly() -> None:
+    """LAPACK's singular values of what overflowed took 10 s and more."""
+    rng = np.random.default_rng(1)
+    pos = rng.normal(size=(1, 4, 3)) + rng.normal(0, 1e-3, (50, 4, 3))
+    pos[20, 2, 1], pos[21, 0, 0] = 1e200, np.inf
+    rot, _, shape, misfit = cluster_attitude(pos)
+    assert np.isfinite(rot[[19, 20, 21, 22]]).all()
+    assert np.isfinite(shape).all()
+    assert misfit < 0.01
 
 
 def test_a_marker_whose_name_is_no_utf8_is_read(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from ..contract import ChannelSpec, CommonOptions, Import, ReportBuilder
 from ..leg import JOINT_TOPIC, JOINTS, ORIENTATION, QUAT, rotations
 from ..legchecks import unwrapped
 from ..optical import FloatArray, blocks_of, float_rows, read_text
+from ..timestamps import nanoseconds
 
 _UNIT = re.compile(r"(?P<name>.+?)(?:_(?P<tail>deg|rad)|\s*[(\[](?P<unit>deg|rad|°)[)\]])", re.IGNORECASE)
 _TIME = re.compile(r"(t|time|timestamp)(_s|\s*[(\[]s(ec)?[)\]])?", re.IGNORECASE)
@@ -151,7 +152,7 @@ def _joints(
     spec = ChannelSpec(
         JOINT_TOPIC, JOINTS, "", tuple(names), {"source": "table of angles, signs as in the file"}
     )
-    t_ns = np.rint(values[:, 0] * 1e9).astype(np.int64)
+    t_ns = nanoseconds(values[:, 0], 1e9)
     blocks = blocks_of(t_ns, rows, [(JOINT_TOPIC, table)], report)
     return Import(
         channels=[spec],
@@ -164,7 +165,7 @@ def _joints(
 def _orientations(
     names: Sequence[str], values: FloatArray, rows: np.ndarray, report: ReportBuilder, device: dict[str, str]
 ) -> Import:
-    t_ns = np.rint(values[:, 0] * 1e9).astype(np.int64)
+    t_ns = nanoseconds(values[:, 0], 1e9)
     specs = [ChannelSpec(f"/reference/{n}/orientation", ORIENTATION, "optical") for n in names]
     tables = [
         (s.topic, pl.DataFrame({q: values[:, 1 + 4 * k + j] for j, q in enumerate(QUAT)}))

@@ -23,6 +23,7 @@ from ...recording.events import bids_events
 from ...recording.files import read_small
 from ..contract import ChannelSpec, CommonOptions, Import, ReportBuilder
 from ..optical import blocks_of, float_rows, read_text
+from ..timestamps import nanoseconds
 from ..units import conversion
 
 _NAME = re.compile(
@@ -155,7 +156,7 @@ class _System:
             for name, c in self._fields[spec.topic].items():
                 series = pl.Series(values[:, c.place] * c.factor + c.offset)
                 if name.endswith("_ns"):
-                    series = pl.Series(self.start_ns + np.rint(values[:, c.place] * 1e9).astype(np.int64))
+                    series = pl.Series(nanoseconds(values[:, c.place], 1e9, self.start_ns))
                 elif c.dtype != "Float64":
                     series = series.cast(getattr(pl, c.dtype))
                 columns[name] = series
@@ -173,7 +174,7 @@ class _System:
                     f"{self.path}: has no LATENCY channel, and {_beside(self.path, 'motion.json').name} no "
                     "SamplingFrequency above 0; state one of them"
                 )
-            return self.start_ns + np.rint((rows - 1) * (1e9 / rate)).astype(np.int64), values, rows
+            return nanoseconds(rows - 1, 1e9 / rate, self.start_ns), values, rows
         factor, _ = conversion(str(self._channels["units"][self._latency]), "ns")
         seconds = values[:, self._latency]
         finite = np.isfinite(seconds)
@@ -185,7 +186,7 @@ class _System:
                 line=int(rows[~finite][0]),
             )
             values, rows, seconds = values[finite], rows[finite], seconds[finite]
-        t_ns = self.start_ns + np.rint(seconds * factor).astype(np.int64)
+        t_ns = nanoseconds(seconds, factor, self.start_ns)
         if len(t_ns) > 2 and isinstance(rate, int | float) and rate > 0:
             measured = (len(t_ns) - 1) * 1e9 / max(1, int(t_ns[-1] - t_ns[0]))
             if abs(measured / rate - 1.0) > 0.02:

@@ -20,6 +20,7 @@ from ...recording.errors import MarchaError, UsageError
 from ..contract import ChannelSpec, Import, ReportBuilder
 from ..leg import unique_markers
 from ..optical import MarkerOptions, blocks_of, marker_import
+from ..timestamps import MOST_NS, nanoseconds, possible_rate
 from ..units import conversion
 
 READ_S = 300.0
@@ -96,9 +97,8 @@ class C3d:
         if not head["units"]:
             report.note("unit_doubt", "POINT:UNITS is missing: positions taken for mm, as C3D has by default")
         rate = head["rate_hz"]
-        if not rate > 0:
-            raise MarchaError(f"{path}: its frame rate is {rate:g}; set POINT:RATE")
-        t_ns = np.rint((head["first_frame"] + np.arange(len(pos))) * (1e9 / rate)).astype(np.int64)
+        possible_rate(rate, path, "set POINT:RATE")
+        t_ns = nanoseconds(head["first_frame"] + np.arange(len(pos)), 1e9 / rate)
         device = {"time": "frames at the header's rate; frame 1 is at 0", "rate_hz": f"{rate:g}"}
         analog = _analog(path, head, signals, rate)
         if pos.shape[1]:
@@ -108,12 +108,12 @@ class C3d:
             channels, blocks = list(markers.channels), markers.blocks()
         else:
             channels, blocks = [], iter(())
-        frame_ns = np.rint(
-            head["first_frame"] * (1e9 / rate)
-            + np.arange(len(signals)) * (1e9 / (head["analog_rate_hz"] or rate))
+        analog_rate = possible_rate(head["analog_rate_hz"] or rate, path, "set ANALOG:RATE")
+        frame_ns = nanoseconds(
+            head["first_frame"] * (1e9 / rate) + np.arange(len(signals)) * (1e9 / analog_rate), 1.0
         )
         rows = blocks_of(
-            frame_ns.astype(np.int64),
+            frame_ns,
             np.arange(1, len(signals) + 1),
             [(s.topic, t) for s, t in analog],
             report,
@@ -170,13 +170,13 @@ def _events(path: Path, head: dict[str, Any]) -> pl.DataFrame | None:
     used, seconds, labels = head["events"], head["event_s"], head["event_labels"]
     if not used:
         return None
-    if len(seconds) < used or len(labels) < used or not np.isfinite(seconds[:used]).all():
+    if len(seconds) < used or len(labels) < used or not all(abs(t) * 1e9 <= MOST_NS for t in seconds[:used]):
         raise MarchaError(
             f"{path}: EVENT: says {used} events, has {len(seconds)} times and {len(labels)} labels; "
             "remove the group or export the file again"
         )
     contexts = [c.strip() for c in head["event_contexts"]] + [""] * used
-    t_ns = pl.Series(np.rint(np.array(seconds[:used]) * 1e9).astype(np.int64))
+    t_ns = pl.Series(nanoseconds(seconds[:used], 1e9))
     tiers = [c or "events" for c in contexts[:used]]
     return pl.DataFrame(
         {"tier": tiers, "start_ns": t_ns, "end_ns": t_ns, "label": [x.strip() for x in labels[:used]]}

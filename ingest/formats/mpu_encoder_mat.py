@@ -20,6 +20,7 @@ from ..leg import IMU, JOINTS, ORIENTATION, QUAT, Segments, renamed, rotations
 from ..legchecks import unwrapped
 from ..matfile import MAGIC, read_mat
 from ..optical import blocks_of
+from ..timestamps import nanoseconds
 
 ENCODER = "/leg/encoder"
 NEEDED = {"all_time", "all_encoder", "all_gyro_1_x", "all_accel_1_x", "all_gyro_2_x", "all_accel_2_x"}
@@ -144,4 +145,4 @@ def _times(time: np.ndarray, report: ReportBuilder) -> tuple[np.ndarray, str]:
             count=1,
             subject="all_time",
         )
-    return np.rint(time * (1e9 if seconds else 1e6)).astype(np.int64), "s" if seconds else "ms"
+    return nanoseconds(time, 1e9 if seconds else 1e6), "s" if seconds else "ms"

@@ -38,6 +38,7 @@ from ..phonelog import (
     xyz,
 )
 from ..text import start_of
+from ..timestamps import nanoseconds
 
 WANTED = '"Time (s)","X (m/s^2)",…'
 TIME = re.compile(r"(?:time|zeit|temps|tiempo|tempo) \(s\)", re.IGNORECASE)
@@ -296,13 +297,13 @@ def _frames(file: Path, header: Header, runs: list[_Run], report: ReportBuilder)
     for frame in float_blocks(file, header, time, report):
         seconds = frame[time].to_numpy()
         if not runs:
-            t = pl.Series("t", np.round(seconds * 1e9).astype(np.int64))
+            t = pl.Series("t", nanoseconds(seconds, 1e9))
             yield pl.DataFrame([*(s for s in frame.get_columns() if s.name != time), t])
             continue
         starts = np.array([r.start_s for r in runs])
         run = np.maximum(np.searchsorted(starts, seconds, side="right") - 1, 0)
         origin = np.array([r.system_ns for r in runs])[run]
-        t = origin + np.round((seconds - starts[run]) * 1e9).astype(np.int64)
+        t = nanoseconds(seconds - starts[run], 1e9, origin)
         late = seconds > runs[-1].end_s + _LATE_S
         if late.any():
             report.drop(

@@ -31,6 +31,7 @@ from ..leg import (
 from ..mapping import CellSource, Mapping, TextLayout, Time, Topic
 from ..orientations import OrientationOptions, with_angles
 from ..text import read_blocks
+from ..timestamps import possible_rate
 from .table import open_table
 
 _RATE = re.compile(rb"^#\s*sampling frequency:\s*(\d{1,9}(?:\.\d*)?)(?![\d.])", re.MULTILINE)
@@ -91,7 +92,13 @@ class SegmentsCsv:
         topics = _topics(header, options, path)
         note_arbitrary(report, [t.name for t in topics if t.schema == MAG], options.field_ut)
         layout = TextLayout(separator=header.separator, skip_rows=header.line - 1)
-        mapping = Mapping(topic=topics, time=Time(rate_hz=float(rate[1])), layout=layout)
+        mapping = Mapping(
+            topic=topics,
+            time=Time(
+                rate_hz=possible_rate(float(rate[1]), path, "correct its line of the sampling frequency")
+            ),
+            layout=layout,
+        )
         channels, blocks = open_table(path, mapping, path, report)
         turning = [t.name for t in topics if t.schema == ORIENTATION]
         channels, blocks = with_angles(

@@ -30,6 +30,7 @@ from ..phonelog import (
     require_rows,
     xyz,
 )
+from ..timestamps import nanoseconds
 from .androsensor import orientation_part
 
 WANTED = "TimeStamp[ms];…;AccX[m/s^2];AccY[m/s^2];AccZ[m/s^2];…"
@@ -136,5 +137,5 @@ def _frames(path: Path, header: Header, press: str | None, report: ReportBuilder
                     )
             if hecto or "hpa" in press.lower():
                 frame = frame.with_columns(pl.col(press) * HECTOPASCAL)
-        t = np.round(frame[TIME].to_numpy()).astype(np.int64) * 1_000_000
+        t = nanoseconds(frame[TIME].to_numpy(), 1.0, tick_ns=1_000_000)
         yield frame.with_columns(t=pl.Series(t)).drop(TIME)

@@ -29,7 +29,7 @@ from ..mapping import (
     schema_name,
     targets,
 )
-from ..timestamps import MOST_NS, TimestampRepair
+from ..timestamps import MOST_NS, TimestampRepair, nanoseconds
 
 #: Share of the full scale at which a 16-bit converter says its last count.
 LAST_COUNT = 1 - 1.5 / 32768
@@ -245,7 +245,7 @@ class _File:
         timeless = frame["t"].is_null()
         if timeless.any():
             first = int(timeless.arg_true()[0])
-            text = block[f"c{self._time_at}"][first]
+            text = "" if self._time_at is None else block[f"c{self._time_at}"][first]
             self._report.drop(
                 "bad_row",
                 f"{self.path.name}: {text!r} is no time ({self._time.unit}); row dropped",
@@ -269,7 +269,7 @@ class _File:
             assert time.rate_hz is not None
             rows = np.arange(self._rows, self._rows + block.height, dtype=np.float64)
             self._rows += block.height
-            return pl.Series(np.rint(rows * (1e9 / time.rate_hz)).astype(np.int64))
+            return pl.Series(nanoseconds(rows, 1e9 / time.rate_hz))
         text = block[f"c{self._time_at}"].str.strip_chars()
         if time.unit == "datetime":
             if time.format is None:

@@ -38,6 +38,7 @@ from ..headers import (
 from ..inertial import ACC, FIELD, GYR, IMU, MAG
 from ..phonelog import AXES, QUATERNION, quaternion_of
 from ..radio import RADIO, local_address, ordered, signed_powers, technology_of, without_stale
+from ..timestamps import nanoseconds
 
 TIME = r"(time|time ?stamp|t|ts|date|datetime|instant|tempo|epoch)( (ns|us|µs|ms|s))?"
 INERTIAL = {
@@ -367,4 +368,4 @@ def _seen(cells: pl.DataFrame, unit: TimeUnit) -> pl.Series:
     if "seen" not in cells.columns or unit.seconds == 0.0:
         return pl.Series("seen", np.zeros(cells.height, np.int64))
     value: Any = cells["seen"].cast(pl.Float64, strict=False).fill_null(0.0).to_numpy()
-    return pl.Series("seen", np.round(value * (unit.seconds * 1e9)).astype(np.int64))
+    return pl.Series("seen", nanoseconds(value, unit.seconds * 1e9))

@@ -13,6 +13,7 @@ from ...recording.errors import MarchaError, UsageError
 from ..contract import Import, ReportBuilder
 from ..leg import unique_markers
 from ..optical import MarkerOptions, float_rows, marker_import, read_text
+from ..timestamps import nanoseconds
 from ..units import conversion
 
 
@@ -75,7 +76,7 @@ class Trc:
                 "bad_row", "a row without a time; dropped", count=int(timeless.sum()), line=int(rows[first])
             )
             values, rows = values[~timeless], rows[~timeless]
-        t_ns = np.rint(values[:, 1] * 1e9).astype(np.int64)
+        t_ns = nanoseconds(values[:, 1], 1e9)
         pos = values[:, 2:].reshape(len(values), -1, 3) * factor
         if options.y_up:
             pos = pos[..., [0, 2, 1]] * np.array([1.0, -1.0, 1.0])

@@ -14,6 +14,7 @@ from ...recording.errors import MarchaError, UsageError
 from ..contract import ChannelSpec, Import, ReportBuilder
 from ..leg import JOINT_TOPIC, JOINTS, unique_markers
 from ..optical import FloatArray, MarkerOptions, blocks_of, float_rows, marker_import, read_text
+from ..timestamps import nanoseconds, possible_rate
 from ..units import conversion
 
 SECTIONS = ("Trajectories", "Model Outputs")
@@ -120,11 +121,12 @@ def _section(path: Path, lines: Sequence[str], k: int, report: ReportBuilder) ->
     columns = ["Frame", "Sub Frame", *(f"{n} {a}" for n in names for a in "XYZ")]
     values, rows = float_rows(path, lines[first:end], first + 1, separator, columns, report)
     per_name = [units[2 + 3 * i] if len(units) > 2 + 3 * i else "" for i in range(len(names))]
-    return _Section(float(_word(lines[k + 1])), names, per_name, values, rows)
+    rate = possible_rate(float(_word(lines[k + 1])), path, f"correct line {k + 2}")
+    return _Section(rate, names, per_name, values, rows)
 
 
 def _times(section: _Section) -> np.ndarray:
-    return np.rint((section.values[:, 0] - 1) * (1e9 / section.rate_hz)).astype(np.int64)
+    return nanoseconds(section.values[:, 0] - 1, 1e9 / section.rate_hz)
 
 
 def _angles(section: _Section) -> tuple[ChannelSpec, pl.DataFrame, _Section] | None:

@@ -36,7 +36,7 @@ from ..inertial import (
     tables,
 )
 from ..matfile import MAGIC, Variable, read_mat
-from ..timestamps import TimestampRepair
+from ..timestamps import TimestampRepair, nanoseconds
 
 POSE = ChannelSpec(
     "/reference/pose",
@@ -127,7 +127,7 @@ def _load(path: Path, mirror: Mirror) -> pl.DataFrame:
     lost = np.flatnonzero(~np.isfinite(ts))
     if lost.size:
         raise MarchaError(f"{path}: ts[{lost[0]}] is {ts[lost[0]]}; every row needs a time")
-    columns: dict[str, Any] = {"t": np.round(ts * 1e9).astype(np.int64), "line": np.arange(1, ts.size + 1)}
+    columns: dict[str, Any] = {"t": nanoseconds(ts, 1e9), "line": np.arange(1, ts.size + 1)}
     columns |= dict(zip((*ACC, *GYR), imu.T, strict=True)) | dict(zip(POSITION, gt.T, strict=True))
     stance = file["zv_vicon_opt"].values if "zv_vicon_opt" in file else None
     if stance is not None and stance.size == ts.size:

@@ -36,7 +36,7 @@ from ..inertial import (
     tables,
     x_io_columns,
 )
-from ..timestamps import TimestampRepair
+from ..timestamps import Rate, TimestampRepair, nanoseconds
 
 COUNTER = "Packet number"
 WANTED = "Packet number,Gyroscope X (deg/s),…,Accelerometer X (g),…"
@@ -52,7 +52,7 @@ class XimuOptions(CommonOptions, frozen=True, kw_only=True):
     """
 
     rate_hz: Annotated[
-        float, msgspec.Meta(gt=0, description="rate of the inertial packets, Hz: the file has no time")
+        Rate, msgspec.Meta(description="rate of the inertial packets, Hz: the file has no time")
     ] = 256.0
 
 
@@ -120,7 +120,7 @@ def _frames(path: Path, header: Header, rate_hz: float, report: ReportBuilder) -
         # A row that repeats the one before, counter included, is no new place in time: the clock drops it.
         place -= np.cumsum(steps == 0)
         row, last = int(place[-1]), counter[-1]
-        t = np.round(place * (1e9 / rate_hz)).astype(np.int64)
+        t = nanoseconds(place, 1e9 / rate_hz)
         yield frame.with_columns(t=pl.Series(t)).drop(COUNTER)
 
 

@@ -32,6 +32,7 @@ from ..leg import (
 from ..mapping import CellSource, Mapping, TextLayout, Time, Topic
 from ..orientations import DEVICE_TOPIC, OrientationOptions, with_angles
 from ..text import read_blocks
+from ..timestamps import Rate, possible_rate
 from .table import open_table
 
 COUNTERS = ("PacketCounter", "Counter")
@@ -63,7 +64,7 @@ class XsensOptions(OrientationOptions, frozen=True, kw_only=True):
 
     segments: Segments = None
     rate_hz: Annotated[
-        Annotated[float, msgspec.Meta(gt=0)] | None,
+        Rate | None,
         msgspec.Meta(description="packets per second, where the file's comments do not say"),
     ] = None
     field_ut: FieldStrength = 50.0
@@ -112,7 +113,7 @@ class XsensText:
             rate = options.rate_hz or header.rate_hz
             if rate is None:
                 raise MarchaError(f"{path}: no '// Update Rate: …' line; say it with --set rate_hz=100")
-            rates.add(rate)
+            rates.add(possible_rate(rate, path, "say it with --set rate_hz=100"))
             topics = _topics(names[key], header, path, options.field_ut * 1e-6)
             magnetic += [t.name for t in topics if t.schema == MAG]
             layout = TextLayout(separator=header.separator, skip_rows=header.line - 1, comment="//")

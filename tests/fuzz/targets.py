@@ -49,14 +49,16 @@ def call(folder: Path, action: Callable[[], Any], output: Path | None = None) ->
     """Call the library, judge what it says and leaves, and return what it returns; None where it refuses."""
     before = _files(folder)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
             found = action()
     except MarchaError as error:
         _judge_line(str(error))
         if left := _files(folder) - before:
             raise Failure("left behind", f"{sorted(map(str, left))[:3]} after {error}"[:300]) from None
         return None
+    if warned:
+        raise Failure("message", f"{warned[0].filename}:{warned[0].lineno}: {warned[0].message}")
     left = {p for p in _files(folder) - before if p.name.startswith(".")}
     if left or (output is not None and not output.exists()):
         raise Failure("left behind", f"{sorted(map(str, left))[:3]}, or no output")
