@@ -26,7 +26,7 @@ from .test_viz_viewer import needs_vulkan
 S = 10**9
 PACE_S = 0.3
 """A hand is no faster; without graphics hardware the viewer draws a few pictures a second."""
-RULER = (790, 797, 783)
+RULER = (790, 797, 783, 776, 804, 811)
 """Heights at which the time ruler of a window of 900 pixels is."""
 
 
@@ -208,13 +208,13 @@ def test_a_range_dragged_with_a_real_mouse_is_marked_shown_undone_and_saved(
     )
     assert program.stdin is not None
     assert program.stderr is not None
-    late = threading.Timer(180.0, program.kill)  # nothing below waits for ever
+    late = threading.Timer(240.0, program.kill)  # nothing below waits for ever
     late.start()
     try:
         address = heard(program.stderr, "the viewer is at").split()[-1]
         heard(program.stderr, "leave;")
         client = ViewerClient.connect(address)
-        marked = _dragged(client)
+        marked = _dragged(client, tmp_path / "first.png")
         assert marked is not None, "no drag on the ruler selected a range"
         typed(program.stdin, "\n")
         said = heard(program.stderr, "marked manual: 'mark'")
@@ -238,17 +238,20 @@ def test_a_range_dragged_with_a_real_mouse_is_marked_shown_undone_and_saved(
     assert (row["tier"], row["label"], row["source"]) == ("manual", "mark", "human:eva")
 
 
-def _dragged(client: Any) -> tuple[int, int] | None:
+def _dragged(client: Any, picture: Path) -> tuple[int, int] | None:
     """Drag along the ruler; return the range that the viewer says is selected then, asked by other means."""
 
     def mouse(*arguments: object) -> None:
         subprocess.run(["xdotool", *map(str, arguments)], check=True, capture_output=True)
-        until = time.monotonic() + PACE_S
-        while time.monotonic() < until:  # what the viewer answers it has drawn
+        until, answers = time.monotonic() + PACE_S, 0
+        while time.monotonic() < until or answers < 2:  # the second is of a picture begun after the movement
             client.get_state()
+            answers += 1
 
-    until = time.monotonic() + 90
+    until = time.monotonic() + 120
     while time.monotonic() < until:
+        # A drag before the first whole picture may pull the panel's edge away and the ruler with it.
+        client.save_screenshot(str(picture))
         for y in RULER:
             mouse("mousemove", 600, y)
             mouse("mousedown", 1)
