@@ -407,6 +407,7 @@ class Recording:
         if isinstance(source.decoder, EventDecoder):
             return source.decoder.decode(_nothing(b""))
         channel = self.channels[source.topic]
+        self._source(source.topic)  # to describe a channel may have shown that it cannot be read
         if channel.count and (first := self._first(source)) is not None:
             return first[0].clear()
         schema = source.decoder.schema if source.decoder is not None else None

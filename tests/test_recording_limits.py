@@ -77,8 +77,9 @@ def test_a_first_time_far_from_the_rest_is_no_endless_work(tmp_path: Path) -> No
     assert converted(tmp_path, rows).report.rows_read == 301
 
 
-def test_a_missing_cell_has_no_full_scale(tmp_path: Path) -> None:
-    rows = [f"{k * 10**7},0.{k % 7},{'' if k == 3 else k % 3},9.8" for k in range(50)]
+@pytest.mark.parametrize("missing", ["", "-"])
+def test_a_missing_cell_has_no_full_scale(tmp_path: Path, missing: str) -> None:
+    rows = [f"{k * 10**7},0.{k % 7},{missing if k == 3 else k % 3},9.8" for k in range(50)]
     findings = {f.kind for f in converted(tmp_path, rows).report.findings}
     assert "missing_cell" in findings
     assert "clipped" not in findings

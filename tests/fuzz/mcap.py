@@ -405,13 +405,13 @@ def odd(rng: Rng, data: bytes) -> bytes:
     channels: dict[int, int] = {}
     for part in parts:
         if part.opcode == Opcode.SCHEMA and (old := int.from_bytes(part.body[:2], "little")) not in schemas:
-            title, encoding, text = _texts(part.body[2:], 3)
+            title, encoding, text = texts(part.body[2:], 3)
             schemas[old] = writer.register_schema(title.decode(), encoding.decode(), text)
     for part in parts:
         if part.opcode == Opcode.CHANNEL and (old := int.from_bytes(part.body[:2], "little")) not in channels:
-            topic, encoding, about = _texts(part.body[4:], 3)
+            topic, encoding, about = texts(part.body[4:], 3)
             name = topic.decode() if rng.random() < 0.7 else str(pick(rng, NAMES))
-            pairs = _texts(about, 1 << 16)
+            pairs = texts(about)
             said = dict(
                 zip((p.decode() for p in pairs[::2]), (p.decode() for p in pairs[1::2]), strict=False)
             )
@@ -491,7 +491,7 @@ def _own_channels(rng: Rng, writer: Writer) -> list[tuple[int, bytes]]:
     return found
 
 
-def _texts(body: bytes, most: int) -> list[bytes]:
+def texts(body: bytes, most: int = 1 << 16) -> list[bytes]:
     found, at = [], 0
     while at + 4 <= len(body) and len(found) < most:
         n = int.from_bytes(body[at : at + 4], "little")
