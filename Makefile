@@ -9,7 +9,7 @@ demo: $(VENV)/.stamp
 	$(BIN)/marcha demo -o demo --force $(if $(SHOW),--show)
 
 test: $(VENV)/.stamp-dev
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
 # Damaged inputs for all that reads; what failed is named with what reproduces it.
 N ?= 10000
