@@ -10,6 +10,7 @@ from typing import NamedTuple
 from ..recording.errors import MarchaError
 from . import registry
 from .archive import UNPACK_LIMIT_GB, is_zip, unpacked
+from .workbook import is_workbook
 
 
 class LogsFound(NamedTuple):
@@ -79,20 +80,75 @@ def logs(
         if not folder.is_dir() or _names(folder, format):
             logs_here.append(path)
             continue
-        inside = []
-        for file in sorted(p for p in folder.rglob("*") if p.is_file()):
-            if any(part.startswith(".") or part == "__MACOSX" for part in file.relative_to(folder).parts):
-                continue
-            if names := _names(file, format):
-                inside.append(registry.chief_of(file, names[0]))
-            else:
-                skipped.append((file, f"not {format}" if format else "no known format"))
-        inside = list(dict.fromkeys(inside))
-        logs_here += inside if len(inside) > 1 or folder == path else [path]
+        own = folder == path
+        seen = _scan(
+            folder, stack, format, unpack_limit_gb if own else unpack_limit_gb - _size_gb(folder), own
+        )
+        skipped += seen.skipped
+        archives |= seen.archives
+        packed = any(p.is_file() and is_zip(p) for p in seen.logs)
+        logs_here += seen.logs if own or packed or len(seen.logs) > 1 else [path]
     sides = {(log.parent, f"{log.stem}.truth") for log in logs_here}  # they come along with their log
     skipped = [(p, why) for p, why in skipped if not any(log in p.parents for log in logs_here)]
     skipped = [(p, why) for p, why in skipped if (p.parent, p.name[: p.name.find(".truth") + 6]) not in sides]
     return LogsFound(list(dict.fromkeys(logs_here)), skipped, archives)
+
+
+def _scan(
+    folder: Path,
+    stack: contextlib.ExitStack,
+    format: str | None,
+    limit_gb: float,
+    own: bool,
+    deep: bool = True,
+) -> LogsFound:
+    """Return the logs in and below a folder, which is the user's ``own`` or an archive's, archives in it included.
+
+    Archives of an archive share its limit, and what lies packed in them once more is left out.
+    """
+    inside: list[Path] = []
+    skipped: list[tuple[Path, str]] = []
+    archives: dict[Path, Path] = {}
+    for file in _files(folder):
+        if names := _names(file, format):
+            inside.append(registry.chief_of(file, names[0]))
+            continue
+        if not deep or not is_zip(file) or is_workbook(file):
+            skipped.append((file, f"not {format}" if format else "no known format"))
+            continue
+        try:
+            unpacked_to = stack.enter_context(unpacked(file, max(limit_gb, 0.0)))
+        except MarchaError as error:
+            skipped.append((file, str(error).removeprefix(f"{file}: ")))
+            continue
+        archives[unpacked_to] = file
+        limit_gb -= 0.0 if own else _size_gb(unpacked_to)
+        if _names(unpacked_to, format):
+            inside.append(file)
+            continue
+        more = _scan(unpacked_to, stack, format, limit_gb, False, deep=own)
+        archives |= more.archives
+        if not more.logs:
+            skipped.append((file, "an archive without a known format"))
+        elif len(more.logs) == 1 and not is_zip(more.logs[0]):
+            inside.append(file)
+        else:
+            inside += more.logs
+            skipped += more.skipped
+    return LogsFound(list(dict.fromkeys(inside)), skipped, archives)
+
+
+def _files(folder: Path) -> list[Path]:
+    """Return the files of a folder and below it, without hidden ones and those of macOS."""
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    hidden = (
+        any(part.startswith(".") or part == "__MACOSX" for part in f.relative_to(folder).parts) for f in files
+    )
+    return [f for f, hide in zip(files, hidden, strict=True) if not hide]
+
+
+def _size_gb(folder: Path) -> float:
+    return sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()) / 1e9
 
 
 def _names(path: Path, format: str | None) -> list[str]:

@@ -301,6 +301,11 @@ def _resolve(
     inside = list(dict.fromkeys((name, chief_of(p, name)) for name, p in parts))
     if not inside and wanted is not None and len(files) == 1:
         return [(wanted.importer.name, files[0])]
+    if not inside and (packed := [p for p in files if is_zip(p)]):
+        raise MarchaError(
+            f"{path}: holds archives ({', '.join(p.name for p in packed[:4])}{' …' if packed[4:] else ''}); convert "
+            "each log in them to a recording of its own with -o FOLDER/"
+        )
     if not inside:
         raise MarchaError(f"{path}: unknown content in all of its {len(files)} files; {_tried()}")
     if len(inside) > 1:

@@ -152,6 +152,27 @@ def test_sensor_logger_has_one_sign_and_gravity(
     assert imported.metadata["device"]["platform"] == platform
 
 
+@pytest.mark.parametrize(("platform", "standard"), [("android", False), ("ios", False), ("ios", True)])
+def test_sensor_logger_without_metadata_is_turned_by_the_field(
+    tmp_path: Path, platform: str, standard: bool
+) -> None:
+    """In Munich, where the field dips by 64°."""
+    walk = samples.short_walk(lat_deg=48.1, lon_deg=11.6, alt_m=520.0)
+    folder = samples.sensor_logger(tmp_path / "log", walk, platform, standard)
+    (folder / "Metadata.csv").unlink()
+    _, tables, report = read(SensorLogger(), folder)
+    assert same(tables["/phone/acc"], ACC, walk.acc_b, 1e-5)
+    assert "the magnetic field there" in next(
+        f.detail for f in report.findings if f.kind == "assumed_platform"
+    )
+    (folder / "Location.csv").unlink()  # nobody knows the field
+    _, tables, report = read(SensorLogger(), folder)
+    assert same(
+        tables["/phone/acc"], ACC, walk.acc_b * (-1 if platform == "ios" and not standard else 1), 1e-5
+    )
+    assert "set platform=ios" in next(f.detail for f in report.findings if f.kind == "assumed_platform")
+
+
 @pytest.mark.parametrize("kind", ["json", "sqlite", "zip"])
 def test_sensor_logger_in_one_file_is_the_same(tmp_path: Path, walk: PhoneWalk, kind: str) -> None:
     folder = samples.sensor_logger(tmp_path / "log", walk, "ios")
@@ -356,6 +377,41 @@ def test_walks_in_one_zip_are_recordings_of_their_own(tmp_path: Path, walk: Phon
         for folder in found.logs:
             done = convert(folder, tmp_path / f"{folder.name}.mcap")
             assert {c.topic: c.count for c in done.channels}["/phone/acc"] == len(walk.t_ns)
+
+
+@pytest.mark.parametrize("outer", ["folder", "zip"])
+def test_zips_in_a_folder_or_a_zip_are_recordings_of_their_own(
+    tmp_path: Path, walk: PhoneWalk, outer: str
+) -> None:
+    many = tmp_path / "many"
+    many.mkdir()
+    for name, app in (("a", samples.phyphox), ("b", samples.sensor_logger)):
+        with zipfile.ZipFile(many / f"{name}.zip", "w") as archive:
+            for file in sorted(app(tmp_path / name, walk).rglob("*.csv")):
+                archive.write(file, file.relative_to(tmp_path))
+    made(many / "photos.zip", ("a.jpg", b"x"))
+    (many / "broken.zip").write_bytes(b"PK\x03\x04")
+    path = many
+    if outer == "zip":
+        path = tmp_path / "all.zip"
+        with zipfile.ZipFile(path, "w") as archive:
+            for file in many.iterdir():
+                archive.write(file, file.name)
+        with pytest.raises(MarchaError, match=r"holds archives \(a.zip, .*-o FOLDER/"):
+            convert(path, tmp_path / "o.mcap")
+    with contextlib.ExitStack() as stack:
+        found = logs([path], stack)
+        assert [p.name for p in found.logs] == ["a.zip", "b.zip"]
+        assert sorted(p.name for p, _ in found.skipped) == ["broken.zip", "photos.zip"]
+        for log in found.logs:
+            done = convert(log, tmp_path / f"{log.stem}.mcap")
+            assert {c.topic: c.count for c in done.channels}["/phone/acc"] == len(walk.t_ns)
+    if outer == "zip":
+        with contextlib.ExitStack() as stack:
+            found = logs([path], stack, unpack_limit_gb=path.stat().st_size / 1e9 + 1e-5)
+            why = {p.name: reason for p, reason in found.skipped}
+            assert "unpacks to" in why["a.zip"]  # one limit for all that lies in the archive
+            assert "unpacks to" in why["b.zip"]
 
 
 def test_reference_track(tmp_path: Path, walk: PhoneWalk) -> None:

@@ -62,6 +62,8 @@ _Q = ("qw", "qx", "qy", "qz")
 _AGREES, _CLEARER = np.radians(20.0), np.radians(60.0)
 """An orientation is believed whose vertical lies as near to the measured force, in the median; and the other
 platform's north where it is so much nearer to the field, which iron in the phone turns."""
+_NEAR_DIP = np.radians(30.0)
+"""So near must the measured dip of the field be to the one that the place has, and so far that of the other sign."""
 
 
 class SensorLoggerOptions(CommonOptions, frozen=True, kw_only=True):
@@ -116,14 +118,20 @@ class SensorLogger:
         standard = (
             options.standardised if options.standardised is not None else stated in ("true", "1", "yes")
         )
+        turned = platform == "ios" and not standard
         if platform not in ("android", "ios"):
+            seen = _turned_by_field(tables)
+            turned = bool(seen)
+            platform = "ios" if turned else "android"
             report.note(
                 "assumed_platform",
-                "no metadata say whether this is Android or iOS, whose signs differ: Android is taken; "
-                "set platform=ios",
+                "no metadata say whether this is Android or iOS, whose signs differ: "
+                + (
+                    f"{'Android' if platform == 'android' else 'iOS'} is taken; set platform=ios and standardised"
+                    if seen is None
+                    else f"the magnetic field there and gravity have {'iOS' if turned else 'Android'}'s signs"
+                ),
             )
-            platform = "android"
-        turned = platform == "ios" and not standard
         streams = list(_streams(path, tables, turned, platform, report, attachments))
         return Import(
             channels=declared(s for s, _ in streams),
@@ -147,6 +155,31 @@ class SensorLogger:
                 }
             },
         )
+
+
+def _turned_by_field(tables: dict[str, pl.DataFrame]) -> bool | None:
+    """Return whether gravity has iOS's sign, by the dip of the field at the first fix; None if it cannot tell."""
+    gravity = tables.get("Gravity", tables.get("TotalAcceleration"))
+    fixes = tables.get("LocationGps", tables.get("Location"))
+    if gravity is None or fixes is None or not {"latitude", "longitude"} <= set(fixes.columns):
+        return None
+    fixes = fixes.filter(pl.col("latitude").abs() <= 90, pl.col("longitude").abs() <= 180)
+    field = _beside(tables.get("Magnetometer"), gravity)
+    if field is None or not fixes.height or not set("xyz") <= set(gravity.columns):
+        return None
+    from ..simulate.phone_world import earth_field
+
+    there = earth_field(fixes["latitude"][0], fixes["longitude"][0], 0.0, fixes["t"][0])
+    expected = math.asin(there[2] / float(np.linalg.norm(there)))
+    up = gravity.select("x", "y", "z").to_numpy()
+    size = np.linalg.norm(up, axis=1) * np.linalg.norm(field, axis=1)
+    good = np.isfinite(size) & (size > 0)
+    if not good.any():
+        return None
+    dip = math.asin(float(np.median((up * field).sum(axis=1)[good] / size[good])))
+    if abs(dip - expected) < _NEAR_DIP < abs(dip + expected):
+        return False
+    return True if abs(dip + expected) < _NEAR_DIP < abs(dip - expected) else None
 
 
 def _files(folder: Path) -> list[Path]:
