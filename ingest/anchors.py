@@ -33,6 +33,7 @@ ANCHOR_ROLES = {
     "eta": r"eta|η|n|exponent|path ?loss( ?exponent)?|propagation( constant)?",
     "technology": r"technology|tech|type|kind|radio|tecnologia|tipo",
     "name": r"name|label|nome",
+    "floor": r"(floor|level|storey|story|andar|piso)( (no|number|nr))?",
 }
 NAMED = r"(beacon|anchor|node|device|ap)( (id|mac|address))?|id|uuid"
 """What stands for the address where no column is called one."""
@@ -121,7 +122,7 @@ def read_anchors(
             f"{path}: no header with an address (mac) and x and y, or lat and lon; an anchor table has them"
         )
     cells = read_cells(path, places, header, report)
-    wanted = tuple(r for r in (*LENGTHS, "lat", "lon", "p_d0", "eta") if r in places)
+    wanted = tuple(r for r in (*LENGTHS, "lat", "lon", "p_d0", "eta", "floor") if r in places)
     cells = _in_metres(numbers(cells, wanted, path, report), header, places, path, report)
     cells, own = _on_the_plan(cells, path, report, layout, drawn)
     rows: list[dict[str, Any]] = []

@@ -3,7 +3,7 @@
 An anchor table: :mod:`.anchors`. A plan is GeoJSON (metres, or degrees, which are laid out in metres from the
 south-west corner) or a picture with a scale. What a picture or an outline does not say itself stands in a JSON file
 (``width_m``, ``height_m`` or ``metres_per_pixel``, ``x_m``, ``y_m`` of the lower left corner, ``x_axis_azimuth_deg``,
-``handedness``), or is set as ``plan.width_m=…``.
+``handedness``, ``storey_m``: height of a storey), or is set as ``plan.width_m=…``.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from .contract import ReportBuilder, SourceAttachment
 from .headers import header_of
 from .text import start_of
 
-PLACE_KEYS = ("width_m", "height_m", "metres_per_pixel", "x_m", "y_m", "x_axis_azimuth_deg")
-KINDS = ("wall", "obstacle", "passable", "room", "zone")
+PLACE_KEYS = ("width_m", "height_m", "metres_per_pixel", "x_m", "y_m", "x_axis_azimuth_deg", "storey_m")
+KINDS = ("wall", "obstacle", "passable", "room", "zone", "stairs")
 EAST_DEG = 90.0
 """Azimuth of the x axis of what was laid out from degrees."""
 PICTURES = {b"\x89PNG\r\n\x1a\n": ("plan.png", "image/png"), b"\xff\xd8\xff": ("plan.jpg", "image/jpeg")}
@@ -121,7 +121,9 @@ def read_floor(paths: Sequence[Path], settings: Mapping[str, Any], report: Repor
         floor.attachments.insert(0, table)
         if own is not None:
             place = {"x_axis_azimuth_deg": EAST_DEG, **place}
-    floor.metadata = {k: str(place[k]) for k in ("x_axis_azimuth_deg", "handedness") if k in place}
+    floor.metadata = {
+        k: str(place[k]) for k in ("x_axis_azimuth_deg", "handedness", "storey_m") if k in place
+    }
     return floor
 
 
@@ -145,7 +147,7 @@ def _place(file: Path | None, beside: Path | None, settings: Mapping[str, Any]) 
                 place[key] = float(place[key])
             except (TypeError, ValueError):
                 raise UsageError(f"plan.{key}={place[key]!r} is no number") from None
-            least = 0.0 if key in ("width_m", "height_m", "metres_per_pixel") else -math.inf
+            least = 0.0 if key in ("width_m", "height_m", "metres_per_pixel", "storey_m") else -math.inf
             if not (math.isfinite(place[key]) and place[key] > least):
                 raise UsageError(f"plan.{key}={place[key]:g} must be a positive number of metres")
     if place.get("handedness", "right") not in ("right", "left"):

@@ -19,7 +19,7 @@ from .contract import ChannelSpec, Report, ReportBuilder, SourceAttachment
 
 RADIO = "marcha_msgs/msg/RadioSignal"
 POINT = "geometry_msgs/msg/PointStamped"
-ANCHOR_COLUMNS = ("mac", "technology", "x", "y", "z", "p_d0", "eta", "name")
+ANCHOR_COLUMNS = ("mac", "technology", "x", "y", "z", "p_d0", "eta", "name", "floor")
 REFERENCE = ChannelSpec(
     "/reference/position", POINT, "plan", metadata={"frame": "the plan's x, y and height, m"}
 )

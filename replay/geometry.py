@@ -110,11 +110,13 @@ def power_map_of(
         anchors = anchors_of(context)
     except AlgorithmError as error:
         raise UsageError(f"{rec.path}: {error}") from None
-    radio_map = map_of(context, anchors, height_m)
-    if radio_map is not None:
-        nx, ny = radio_map.mean.shape[1:]
+    storeys = anchors.storeys(context)
+    radio_map = map_of(context, anchors, height_m, storeys)
+    if radio_map is not None:  # of each anchor's own floor
+        own = radio_map.mean[storeys.of_anchor, np.arange(len(anchors))]
+        nx, ny = own.shape[1:]
         x, y = (radio_map.low[k] + radio_map.cell * np.arange(n) for k, n in enumerate((nx, ny)))
-        return PowerMap(x, y, radio_map.mean, anchors, True)
+        return PowerMap(x, y, own, anchors, True)
     low, high = anchors.plane.min(axis=0) - 2.0, anchors.plane.max(axis=0) + 2.0
     x, y = (np.linspace(low[k], high[k], 80) for k in (0, 1))
     gx, gy = np.meshgrid(x, y, indexing="ij")
@@ -152,12 +154,14 @@ def geometry_of(
     context = _context(rec, calibrations)
     try:
         anchors = anchors_of(context)
-        raster = raster_of(context)
+        raster = raster_of(context, anchors.storeys(context).numbers, anchors.plane)
     except AlgorithmError as error:
         raise UsageError(f"{rec.path}: {error}") from None
     low, high = anchors.plane.min(axis=0) - 2.0, anchors.plane.max(axis=0) + 2.0
+    open_cells = None
     if raster is not None:
-        low, high = raster[0], raster[0] + raster[1] * np.array(raster[2].shape)
+        open_cells = raster[2].max(axis=0)  # on any floor
+        low, high = raster[0], raster[0] + raster[1] * np.array(open_cells.shape)
     cell = max(0.25, float(np.sqrt(np.prod(high - low) / CELLS)))
     sigma, up = anchors.relative_sigma, anchors.above(height_m)
 
@@ -175,10 +179,10 @@ def geometry_of(
     plain = maps()
     gx, gy = np.meshgrid(plain["x"], plain["y"], indexing="ij")
     walked = np.ones(gx.shape, dtype=bool)
-    if raster is not None:
+    if raster is not None and open_cells is not None:
         cells = (np.stack([gx, gy]) - raster[0][:, None, None]) / raster[1]
-        i, j = (np.clip(a.astype(int), 0, n - 1) for a, n in zip(cells, raster[2].shape, strict=True))
-        walked = raster[2][i, j] > 0
+        i, j = (np.clip(a.astype(int), 0, n - 1) for a, n in zip(cells, open_cells.shape, strict=True))
+        walked = open_cells[i, j] > 0
     places = np.column_stack([gx[walked], gy[walked]])
     tried = places[:: max(1, len(places) // CANDIDATES)]
     scores = [float(np.median(np.minimum(maps(p)["bound_m"][walked], 1e3))) for p in tried]

@@ -1,8 +1,8 @@
 """Anchors of known position with the parameters of their signals, from what the recording and calibrations say.
 
-A recording has the attachment ``anchors.csv``: ``mac,technology,x,y,z,p_d0,eta,name`` (m, dBm; cells may be
-empty). The calibration ``radio`` has what was measured of them, and goes before the table. An anchor without
-parameters of its own gets the pooled ones of its technology, and that is said.
+A recording has the attachment ``anchors.csv``: ``mac,technology,x,y,z,p_d0,eta,name,floor`` (m, dBm; cells may be
+empty and columns other than ``mac``, ``x``, ``y`` missing). The calibration ``radio`` has what was measured of them, and
+goes before the table. An anchor without parameters of its own gets the pooled ones of its technology, which is said.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..contract import AlgorithmError, Context, FloatArray, Remark
+from .storeys import Storeys, storeys_of
 
 ATTACHMENT = "anchors.csv"
-COLUMNS = ("mac", "technology", "x", "y", "z", "p_d0", "eta", "name")
+COLUMNS = ("mac", "technology", "x", "y", "z", "p_d0", "eta", "name", "floor")
 MIDDLE_M = 5.0
 """A usual distance to an anchor: there the power is known best, and errors of P_d0 and η go together."""
 LEAST_ETA = 0.3
@@ -51,6 +52,8 @@ class Anchors:
         Whether the parameters are pooled ones, shape (n,).
     covariance : ndarray
         Of (P_d0, η) as far as it is known, shape (n, 2, 2); NaN where it is not.
+    floor : ndarray
+        Number of the floor, NaN where it is not stated, shape (n,).
     """
 
     macs: list[str]
@@ -62,6 +65,7 @@ class Anchors:
     remarks: list[Remark] = field(default_factory=list)
     borrowed: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     covariance: FloatArray = field(default_factory=lambda: np.zeros((0, 2, 2)))
+    floor: FloatArray = field(default_factory=lambda: np.zeros(0))
     number: dict[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -79,6 +83,12 @@ class Anchors:
         """Return how far each anchor is above a receiver at ``height_m``, 0 where its height is not known."""
         up = self.position[:, 2] - height_m
         return np.where(np.isnan(up), 0.0, up)
+
+    def storeys(self, context: Context, storey_m: float = 0.0) -> Storeys:
+        """Return the floors of the building and the one that each anchor is on; ``storey_m``: 0 as the plan states."""
+        floor = self.floor if self.floor.size == len(self) else np.full(len(self), np.nan)
+        plan = context.metadata.get("plan", {})
+        return storeys_of(self.position[:, 2], floor, context.attachments, plan, storey_m)
 
     def doubt(self, power_db: float, eta: float) -> FloatArray:
         """Return the covariance of (P_d0, η), shape (n, 2, 2).
@@ -118,7 +128,7 @@ def parse_anchors(data: bytes, label: str = ATTACHMENT) -> list[dict[str, Any]]:
             "technology": (row.get("technology") or "unknown").strip().lower(),
             "name": (row.get("name") or "").strip(),
         }
-        for key in ("x", "y", "z", "p_d0", "eta"):
+        for key in ("x", "y", "z", "p_d0", "eta", "floor"):
             text = (row.get(key) or "").strip()
             try:
                 one[key] = float(text) if text else math.nan
@@ -155,7 +165,10 @@ def anchors_of(context: Context, *, without: str = "", need_model: bool = True) 
     if ATTACHMENT in context.attachments:
         rows = parse_anchors(context.attachments[ATTACHMENT])
     elif measured and all("x" in a for a in measured.values()):
-        rows = [{**dict.fromkeys(("z", "p_d0", "eta"), math.nan), "name": "", **a} for a in measured.values()]
+        rows = [
+            {**dict.fromkeys(("z", "p_d0", "eta", "floor"), math.nan), "name": "", **a}
+            for a in measured.values()
+        ]
     else:
         raise AlgorithmError(
             f"no anchor positions: the recording has no attachment {ATTACHMENT} "
@@ -230,6 +243,7 @@ def anchors_of(context: Context, *, without: str = "", need_model: bool = True) 
         remarks,
         np.array([r["borrowed"] for r in rows], dtype=bool),
         np.array([r["covariance"] for r in rows]).reshape(-1, 2, 2),
+        column("floor"),
     )
 
 

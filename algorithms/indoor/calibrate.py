@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -15,6 +15,7 @@ from ..parameters import meta
 from .anchors import ATTACHMENT, device_of, parse_anchors
 from .pathloss import PathLoss, calibrate_by_distances, power_dbm, regress, trimmed_mean
 from .places import Place, coverage
+from .storeys import storeys_of
 
 FEW_ANCHORS = 4
 """Fewer anchors do not say what the anchors of a technology differ by."""
@@ -93,7 +94,11 @@ class RadioCalibration(Calibrator):
         """
         anchors: dict[str, dict[str, Any]] = {}
         samples: dict[Key, _Point] = {}
+        about: dict[str, bytes] = {}
+        plan: dict[str, str] = {}
         for stretch in stretches:
+            about |= stretch.attachments
+            plan |= stretch.metadata.get("plan", {})
             if ATTACHMENT in stretch.attachments:
                 for row in parse_anchors(stretch.attachments[ATTACHMENT]):
                     anchors.setdefault(row["mac"], row)
@@ -109,7 +114,7 @@ class RadioCalibration(Calibrator):
             raise AlgorithmError(
                 "nothing was heard at a known position; do times of radio and positions meet?"
             )
-        return self._result(anchors, points)
+        return self._result(anchors, points, self._own_floor(anchors, points, about, plan))
 
     def _collect(self, stretch: Stretch, samples: dict[Key, _Point]) -> None:
         reference = [t for name in ("position", "pose") for t in stretch.tables.get(name, ())]
@@ -134,9 +139,32 @@ class RadioCalibration(Calibrator):
                     point.where.append(where[i])
                     point.powers.append(float(powers[i]))
 
-    def _result(self, anchors: dict[str, dict[str, Any]], points: dict[str, list[_Mean]]) -> Calibration:
+    @staticmethod
+    def _own_floor(
+        anchors: dict[str, dict[str, Any]],
+        points: dict[str, list[_Mean]],
+        attachments: Mapping[str, bytes],
+        plan: Mapping[str, str],
+    ) -> dict[str, list[_Mean]]:
+        """Return the points of each anchor that are on its own floor: a slab's loss is no loss of distance."""
+        rows = list(anchors.values())
+        z, floor = (np.array([r[key] for r in rows], dtype=np.float64) for key in ("z", "floor"))
+        storeys = storeys_of(z, floor, attachments, plan)
+        index = dict(zip(anchors, storeys.of_anchor.tolist(), strict=True))
+        return {
+            mac: [p for p in means if storeys.at(p.where[2:3])[0] == index[mac]]
+            for mac, means in points.items()
+            if mac in anchors
+        }
+
+    def _result(
+        self,
+        anchors: dict[str, dict[str, Any]],
+        points: dict[str, list[_Mean]],
+        own_floor: dict[str, list[_Mean]],
+    ) -> Calibration:
         remarks: list[str] = []
-        measured = {m: means for m, means in points.items() if m in anchors}
+        measured = {m: means for m, means in own_floor.items() if means}
         offsets = self._offsets(anchors, measured)
         pooled: dict[str, dict[str, Any]] = {}
         for technology in sorted({anchors[m]["technology"] for m in measured}):
@@ -159,7 +187,9 @@ class RadioCalibration(Calibrator):
                         remarks.append(f"anchor {row['name'] or mac}: {doubt}")
                 except AlgorithmError as error:
                     remarks.append(f"anchor {row['name'] or mac}: {error}")
-            one["points"] = [[*map(float, p.where), p.power - offsets.get(p.device, 0.0)] for p in means]
+            one["points"] = [
+                [*map(float, p.where), p.power - offsets.get(p.device, 0.0)] for p in points[mac]
+            ]
             out.append(one)
         for technology, values in pooled.items():
             fits = np.array(

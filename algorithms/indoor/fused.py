@@ -9,32 +9,50 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from ..contract import AlgorithmError, Context, FloatArray, Input, KernelEstimator, Output, Remark
+from ..contract import (
+    AlgorithmError,
+    Annotate,
+    Context,
+    FloatArray,
+    Input,
+    KernelEstimator,
+    Output,
+    Remark,
+)
 from ..parameters import meta
 from .anchors import Anchors, anchors_of, device_of
-from .floorplan import raster_of
-from .lateration import flatness
-from .particles import (
+from .cloud import (
+    A_V_ETA,
+    ANCHOR_COLUMNS,
     COLUMNS,
     D_ETA,
     D_POWER,
     ERRORS,
     GAIN,
     LOGW,
+    PATTERN,
     SETTINGS,
     SHOWN,
     V_ETA,
     Cloud,
-    run,
     scatter,
 )
+from .floorplan import STAIRS, raster_of
+from .lateration import flatness
+from .particles import run
 from .pdr import ORIENTATION, plan_frame
-from .radio_map import RadioMap, map_of
+from .radio_map import FURTHER_DB, RadioMap, map_of
 from .steps import make_state
 from .trilateration import POSITION, RANGES, SIGMA
 
 STRANGE_DB = 4.0
 """What receivers differ by (standard deviation)."""
+STRANGE_SHARE = 0.3
+"""Probability that a calibrated receiver (or tag) is another than it was: battery, case, hand."""
+SLAB_SD_DB = 5.0
+"""Standard deviation of the loss through slabs, beside the shadowing."""
+LIKELY = 0.8
+"""Probability from which on an offset, or a turning carrier, is said."""
 ON_A_LINE = 0.01
 """Anchors flatter than this are on a line."""
 
@@ -71,7 +89,7 @@ class IndoorFusedParams(msgspec.Struct, frozen=True, kw_only=True):
         float,
         meta(
             "doubt of the offset of this receiver (or tag) to the calibrated ones; learned on the way; −1: 4 where "
-            "a calibration does not know it, else 0",
+            "a calibration does not know it, and for three tenths of the particles where it does",
             "dB",
             "Lui et al. 2011",
             ge=-1,
@@ -80,14 +98,26 @@ class IndoorFusedParams(msgspec.Struct, frozen=True, kw_only=True):
     pattern_db: Annotated[
         float,
         meta(
-            "how much stronger or weaker the receiver (or tag) is on one side, standard deviation along each axis of "
-            "the plan; its turning is followed (0: alike all round)",
+            "how much stronger or weaker a receiver (or tag) that turns is on one side, standard deviation along each "
+            "axis of the plan",
             "dB",
             "",
             ge=0,
         ),
-    ] = 0.0
-    pattern_s: Annotated[float, meta("time over which it looks the same way", "s", "", gt=0)] = 3.0
+    ] = 3.0
+    turning: Annotated[
+        float,
+        meta(
+            "probability that it turns about itself; the powers decide (0: alike all round, never)",
+            "1",
+            "",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.3
+    pattern_s: Annotated[
+        float, meta("time over which one that turns as it likes looks the same way", "s", "", gt=0)
+    ] = 3.0
     freedom: Annotated[float, meta("degrees of freedom of Student's t", "", "Lange et al. 1989", gt=0)] = 4.0
     range_sd_m: Annotated[float, meta("of ranges that are measured as such", "m", "", gt=0)] = 0.3
     speed: Annotated[
@@ -121,11 +151,25 @@ class IndoorFusedParams(msgspec.Struct, frozen=True, kw_only=True):
     height_m: Annotated[
         float, meta("height of the receiver; 0: of the calibration, else 1.2", "m", "", ge=0)
     ] = 0.0
+    storey_m: Annotated[float, meta("height of a storey; 0: as the plan states, else 3.4", "m", "", ge=0)] = (
+        0.0
+    )
+    floor_db: Annotated[
+        float,
+        meta(
+            "loss of the slab between two floors; each further one 4 dB", "dB", "ITU-R P.1238, table 3", ge=0
+        ),
+    ] = 15.0
+    floor_change_s: Annotated[
+        float,
+        meta("mean time between changes of floor, on the stairs of the plan, or anywhere", "s", "", gt=0),
+    ] = 60.0
     margin_m: Annotated[float, meta("how far outside of the anchors one may be", "m", "", ge=0)] = 2.0
     walls: Annotated[bool, meta("walls and passable areas of the plan hold", "")] = True
     known_start: Annotated[bool, meta("start at start_x, start_y; else anywhere", "")] = False
     start_x: Annotated[float, meta("start in the plan", "m", "")] = 0.0
     start_y: Annotated[float, meta("start in the plan", "m", "")] = 0.0
+    start_floor: Annotated[int, meta("floor of the known start", "", "")] = 0
     start_sd_m: Annotated[float, meta("doubt of the start", "m", "", gt=0)] = 1.0
     without: Annotated[str, meta("anchors left out, by address or name", "")] = ""
 
@@ -133,6 +177,15 @@ class IndoorFusedParams(msgspec.Struct, frozen=True, kw_only=True):
 PARTICLES = Output(
     "particles", "marcha_msgs/msg/NamedValues", ("particle_x", "particle_y"), event=True, frame="plan"
 )
+FLOOR_OUTPUT = Output("floor", "marcha_msgs/msg/NamedValues", ("floor", "probability"))
+CHANGE = Output(
+    "change",
+    "marcha_msgs/msg/NamedValues",
+    ("from", "to"),
+    event=True,
+    annotate=Annotate("floor", "instant", label="floor {to}"),
+)
+PRESSURE = Input("pressure", "sensor_msgs/msg/FluidPressure", ("pressure_pa",), optional=True, regular=True)
 
 
 class IndoorFused(KernelEstimator):
@@ -144,7 +197,7 @@ class IndoorFused(KernelEstimator):
     Params: ClassVar[type[msgspec.Struct]] = IndoorFusedParams
     presets: ClassVar = {
         "no-map": {"use_map": False},
-        "turning": {"pattern_db": 2.0},
+        "turning": {"turning": 1.0},
         # Steps between walls alone: nothing but particles keeps the ways round a corner apart.
         "walls": {"particles": 4000, "known_start": True, "start_sd_m": 0.3},
     }
@@ -154,8 +207,9 @@ class IndoorFused(KernelEstimator):
         Input("steps", "marcha_msgs/msg/Step", ("length_m", "heading_rad"), optional=True),
         Input("imu", "sensor_msgs/msg/Imu", ("acc_x", "acc_y", "acc_z"), optional=True, regular=True),
         ORIENTATION,
+        PRESSURE,
     )
-    outputs = (POSITION, SIGMA, PARTICLES)
+    outputs = (POSITION, SIGMA, PARTICLES, FLOOR_OUTPUT, CHANGE)
     max_results = 1 + SHOWN
     run = staticmethod(run)
     state: Any
@@ -167,7 +221,6 @@ class IndoorFused(KernelEstimator):
         self.start_remarks: list[Remark] = []
         heard = context.has("radio") or context.has("ranges")
         stepped = context.has("steps") or (context.has("imu") and context.has("orientation"))
-        raster = raster_of(context) if p.walls else None
         try:
             anchors = anchors_of(context, without=p.without, need_model=context.has("radio"))
         except AlgorithmError:
@@ -181,6 +234,9 @@ class IndoorFused(KernelEstimator):
         if not heard and not (stepped and p.known_start):
             raise AlgorithmError(f"{self.name} needs signal strengths or ranges, or steps from a known start")
         self.anchors = anchors
+        self.storeys = storeys = anchors.storeys(context, p.storey_m)
+        self.start_remarks += storeys.remarks
+        raster = raster_of(context, storeys.numbers, anchors.plane) if p.walls else None
         steps = context.channels.get("steps", ())
         north = plan_frame(context, p.x_axis_azimuth_deg)[2]  # without it headings are taken as the plan's
         self.from_east = bool(steps) and steps[0].frame_id != "plan" and north
@@ -188,11 +244,12 @@ class IndoorFused(KernelEstimator):
         strange = calibration is not None and device_of(context.metadata) not in calibration.values.get(
             "offsets_db", {}
         )
-        self.offset_db = p.offset_db if p.offset_db >= 0 else STRANGE_DB if strange else 0.0
+        self.strange = strange or p.offset_db > 0
+        self.offset_db = p.offset_db if p.offset_db >= 0 else STRANGE_DB if calibration is not None else 0.0
         self.unknown: set[str] = set()
         self.heard: set[int] = set()
         height = p.height_m or (float(calibration.values.get("height_m", 1.2)) if calibration else 1.2)
-        radio_map = map_of(context, anchors, height) if p.use_map else None
+        radio_map = map_of(context, anchors, height, storeys, p.floor_db) if p.use_map else None
         # a mirror image, or a ring about one anchor, is told apart by these alone
         self.sided = p.known_start or radio_map is not None or raster is not None or (stepped and north)
         self.state = self.cloud(context, anchors, radio_map, raster, height, stepped)
@@ -206,17 +263,20 @@ class IndoorFused(KernelEstimator):
         height: float,
         stepped: bool,
     ) -> Cloud:
-        """Return the state before the first message; ``raster``: corner (2,) and cell (m), cells of shape (nx, ny)."""
+        """Return the state before the first message.
+
+        ``raster``: corner (2,) and cell (m), cells of shape (floors, nx, ny).
+        """
         p = self.params
         s = np.zeros(1, SETTINGS)
         if raster is not None:
             low, cell, cells = raster
-            high = low + cell * np.array(cells.shape)
+            high = low + cell * np.array(cells.shape[1:])
         else:
             around = anchors.plane if len(anchors) else np.array([[p.start_x, p.start_y]])
             margin = p.margin_m if len(anchors) else 500.0
             low, high = around.min(axis=0) - margin, around.max(axis=0) + margin
-            cell, cells = 0.0, np.ones((1, 1), np.uint8)
+            cell, cells = 0.0, np.ones((1, 1, 1), np.uint8)
         x_axis, mirrored, oriented = plan_frame(context, p.x_axis_azimuth_deg)
         if stepped and not context.has("steps") and not oriented and p.heading_sd_deg < 90:
             self.start_remarks.append(
@@ -242,8 +302,11 @@ class IndoorFused(KernelEstimator):
             "drift": 0.1,
             "fast": p.fast_db,
             "freedom": p.freedom,
+            "offset": self.offset_db,
+            "offset_share": 1.0 if self.strange else STRANGE_SHARE,
             "pattern": p.pattern_db,
             "pattern_s": p.pattern_s,
+            "turning": p.turning if p.pattern_db > 0 else 0.0,
             "range_sd": p.range_sd_m,
             "wall": math.log(1e-4),
             "step_m": p.step_m,
@@ -251,17 +314,28 @@ class IndoorFused(KernelEstimator):
             "turn_sd": math.radians(p.turn_sd_deg),
             "turn_walk": math.radians(1.0),
             "height": height,
+            "slab": p.floor_db,
+            "further": FURTHER_DB if p.floor_db > 0 else 0.0,
+            "slab_sd": SLAB_SD_DB,
+            "change_hz": 1.0 / p.floor_change_s,
+            "stairs": int((cells == STAIRS).any()),
+            "lowest": self.storeys.numbers[0],
+            "start_floor": self.start_floor(),
+            "floor": -1,
+            "pressure_ns": -1,
+            "weighed_ns": -1,
         }
         for key, value in values.items():
             one[key] = value
         n, k = p.particles, len(anchors)
-        table = np.zeros((k, 11))
-        table[:, :2], table[:, 2] = anchors.plane, anchors.above(height)
+        table = np.zeros((k, ANCHOR_COLUMNS))
+        table[:, :2], table[:, 2] = anchors.plane, np.nan_to_num(self.storeys.above - height)
         table[:, 3], table[:, 4] = anchors.p_d0, anchors.eta
         table[:, 5], table[:, 6] = p.slow_db, p.correlation_m
         doubt = anchors.doubt(p.pooled_db, p.pooled_eta)
         table[:, 7], table[:, 8], table[:, 9] = doubt[:, 0, 0], doubt[:, 1, 1], doubt[:, 0, 1]
-        mean = sd = np.zeros((0, 2, 2))
+        table[:, 11] = self.storeys.of_anchor
+        mean = sd = np.zeros((1, 0, 2, 2))
         if radio_map is not None:
             mean, sd = radio_map.mean, radio_map.sd
             table[:, 10] = radio_map.mapped
@@ -276,14 +350,26 @@ class IndoorFused(KernelEstimator):
             np.zeros((n, k, ERRORS)),
             np.zeros((n, k, ERRORS)),
             table,
+            self.storeys.levels,
             mean,
             sd,
             cells,
         )
         x = p.start_x if p.known_start else math.nan
         offset = math.radians(p.heading_sd_deg)
-        scatter(cloud, x, p.start_y, p.start_sd_m, offset, p.scale_sd, self.offset_db)
+        scatter(cloud, x, p.start_y, p.start_sd_m, offset, p.scale_sd)
         return cloud
+
+    def start_floor(self) -> int:
+        """Return the index of the floor of a known start, −1 where any may be it."""
+        p, numbers = self.params, self.storeys.numbers
+        if not p.known_start or len(numbers) == 1:
+            return -1 if len(numbers) > 1 else 0
+        if p.start_floor not in numbers:
+            raise AlgorithmError(
+                f"start_floor={p.start_floor}: there are floors {numbers[0]} to {numbers[-1]}"
+            )
+        return numbers.index(p.start_floor)
 
     def encode(self, index: int, channel: int, table: pl.DataFrame) -> FloatArray:
         """Return messages as numbers; an address becomes the anchor's number, −1 where it is not known.
@@ -361,7 +447,7 @@ class IndoorFused(KernelEstimator):
         weight = np.exp(self.state.p[:, LOGW])
         weight /= weight.sum()
         remarks: list[Remark] = []
-        doubted = np.flatnonzero(self.anchors.borrowed & (self.state.a[:, 8] > 0))
+        doubted = np.flatnonzero(self.anchors.borrowed & (self.state.a[:, A_V_ETA] > 0))
         told = [k for k in doubted.tolist() if k in self.heard]
         words: list[str] = []
         for k in told:
@@ -373,13 +459,19 @@ class IndoorFused(KernelEstimator):
         if words:
             more = " …" if len(words) > 4 else ""
             remarks.append(Remark("learned_anchors", f"learned on the way: {'; '.join(words[:4])}{more}"))
-        if self.offset_db > 0:
-            gain = self.state.p[:, GAIN]
-            mean = float(weight @ gain)
-            sd = math.sqrt(weight @ (gain - mean) ** 2)
+        gain, turns = self.state.p[:, GAIN], self.state.p[:, PATTERN] > 0
+        mean = float(weight @ gain)
+        sd = math.sqrt(weight @ (gain - mean) ** 2)
+        differs = float(weight @ (gain != 0.0)) > LIKELY and abs(mean) > 2.0 * sd
+        if self.offset_db > 0 and (self.strange or differs):
             remarks.append(
                 Remark(
                     "learned_offset", f"this receiver hears {mean:+.1f} ± {sd:.1f} dB against the calibrated"
                 )
             )
+        if 0 < self.params.turning < 1 and (share := float(weight @ turns)) > LIKELY:
+            detail = (
+                f"receiver (or tag) turns about itself with a probability of {100 * share:.0f} % at the end"
+            )
+            remarks.append(Remark("turning_carrier", detail))
         return remarks

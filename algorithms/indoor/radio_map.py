@@ -7,12 +7,14 @@ Gaussian process of the powers of surveyed points about the log-distance model o
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..contract import Context, FloatArray
 from .anchors import Anchors, device_of, spread_of
+from .storeys import Storeys
 
 LENGTH_M = 8.0
 """Distance over which a deviation from the model is felt; rooms, not centimetres."""
@@ -22,11 +24,13 @@ WEAK = np.array([[149.0, 7.0], [7.0, 1.0]])
 """Covariance of (P_d0, η) where a calibration does not say what anchors differ by: 10 dB at 5 m, and 1 of η."""
 MARGIN_M = 3.0
 CELL_M = 0.5
+FURTHER_DB = 4.0
+"""Loss of each further floor (ITU-R P.1238, table 3)."""
 
 
 @dataclass(frozen=True)
 class RadioMap:
-    """Expected powers on a grid.
+    """Expected powers on a grid of each floor.
 
     Attributes
     ----------
@@ -35,7 +39,7 @@ class RadioMap:
     cell : float
         Distance of the grid's points (m).
     mean, sd : ndarray
-        dBm and dB, shape (anchors, nx, ny).
+        dBm and dB, shape (floors, anchors, nx, ny).
     mapped : ndarray of bool
         Anchors that enough points heard, shape (anchors,); the others have the mean of their model and no ``sd``.
     """
@@ -47,12 +51,28 @@ class RadioMap:
     mapped: NDArray[np.bool_]
 
 
-def map_of(context: Context, anchors: Anchors, height_m: float) -> RadioMap | None:
+def map_of(
+    context: Context, anchors: Anchors, height_m: float, storeys: Storeys | None = None, floor_db: float = 0.0
+) -> RadioMap | None:
     """Return the map of the calibration's surveyed points; None where no anchor has three.
 
     Each anchor's P_d0 and η are part of the process (Rasmussen and Williams 2006, section 2.7), with what the anchors
     of its technology differ by as prior; what is left has the variance that all anchors' residuals have together,
-    half of it room-sized (:data:`LENGTH_M`), half within a wavelength. The doubt has all three.
+    half of it room-sized (:data:`LENGTH_M`), half within a wavelength. The doubt has all three. Points of another floor
+    than a grid's say what the model is, and nothing of that floor's rooms.
+
+    Parameters
+    ----------
+    context : Context
+        With the calibration ``radio``.
+    anchors : Anchors
+        Anchors of the map.
+    height_m : float
+        Of the receiver above its floor (m).
+    storeys : Storeys, optional
+        Floors of the building; default: those of anchors and plan.
+    floor_db : float
+        Loss of the slab between two floors (dB); see :func:`slab_loss_db`.
     """
     calibration = context.calibrations.get("radio")
     if calibration is None or not calibration.usable or not len(anchors):
@@ -62,36 +82,54 @@ def map_of(context: Context, anchors: Anchors, height_m: float) -> RadioMap | No
     mapped = np.array([len(m) >= LEAST_POINTS for m in mine])
     if not mapped.any():
         return None
+    if storeys is None:
+        storeys = anchors.storeys(context)
     surveyed = np.vstack([*(m[:, :2] for m in mine), anchors.plane])
     low = surveyed.min(axis=0) - MARGIN_M
     nx, ny = (np.ceil((surveyed.max(axis=0) + MARGIN_M - low) / CELL_M).astype(int) + 1).tolist()
     axes = low[0] + CELL_M * np.arange(nx), low[1] + CELL_M * np.arange(ny)
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-    up = anchors.above(height_m)
-    models = [
-        _design(anchors, k, grid, np.full(len(grid), up[k])) @ [anchors.p_d0[k], anchors.eta[k]]
-        for k in range(len(mine))
-    ]
-    mean, sd = np.array(models), np.full((len(mine), nx * ny), np.nan)
     offset = float(calibration.values.get("offsets_db", {}).get(device_of(context.metadata), 0.0))
-    designs = [_design(anchors, k, m[:, :2], m[:, 2] - anchors.position[k, 2]) for k, m in enumerate(mine)]
-    for k in np.flatnonzero(mapped).tolist():
+    height = storeys.levels[storeys.of_anchor] + storeys.above
+    floors = [storeys.at(m[:, 2]) for m in mine]
+    losses = [slab_loss_db(f - storeys.of_anchor[k], floor_db) for k, f in enumerate(floors)]
+    designs = [_design(anchors, k, m[:, :2], m[:, 2] - height[k]) for k, m in enumerate(mine)]
+    heard = [m[:, 3] + loss for m, loss in zip(mine, losses, strict=True)]
+    shape = (len(storeys), len(mine), nx * ny)
+    mean, sd = np.empty(shape), np.full(shape, np.nan)
+    for floor, k in np.ndindex(shape[:2]):
+        up = storeys.levels[floor] + height_m - height[k]
+        where = _design(anchors, k, grid, np.full(len(grid), up))
+        loss = float(slab_loss_db(floor - storeys.of_anchor[k], floor_db))
+        mean[floor, k] = where @ [anchors.p_d0[k], anchors.eta[k]] - loss
+        if not mapped[k]:
+            continue
         m, design, technology = mine[k], designs[k], anchors.technology[k]
         alike = [j for j in np.flatnonzero(mapped).tolist() if anchors.technology[j] == technology]
-        variance = _residual_variance([(designs[j], mine[j][:, 3]) for j in alike])
-        prior, spread = spread_of(calibration.values, technology) or (_common(designs, mine, alike), WEAK)
-        where = _design(anchors, k, grid, np.full(len(grid), up[k]))
+        variance = _residual_variance([(designs[j], heard[j]) for j in alike])
+        prior, spread = spread_of(calibration.values, technology) or (_common(designs, heard, alike), WEAK)
         between = np.linalg.norm(m[:, None, :2] - m[None, :, :2], axis=2)
         apart = np.linalg.norm(grid[:, None] - m[None, :, :2], axis=2)
-        cross = 0.5 * variance * np.exp(-apart / LENGTH_M) + where @ spread @ design.T
+        together, here = floors[k][:, None] == floors[k][None, :], floors[k][None, :] == floor
+        cross = 0.5 * variance * np.exp(-apart / LENGTH_M) * here + where @ spread @ design.T
         covariance = (
-            0.5 * variance * (np.exp(-between / LENGTH_M) + np.eye(len(m))) + design @ spread @ design.T
+            0.5 * variance * (np.exp(-between / LENGTH_M) * together + np.eye(len(m)))
+            + design @ spread @ design.T
         )
         weights = np.linalg.solve(covariance, cross.T).T
-        mean[k] = where @ prior + weights @ (m[:, 3] - design @ prior) + offset
+        mean[floor, k] = where @ prior + weights @ (heard[k] - design @ prior) + offset - loss
         whole = variance + np.einsum("ij,jk,ik->i", where, spread, where)
-        sd[k] = np.sqrt(np.maximum(whole - np.einsum("ij,ij->i", weights, cross), 1.0))
-    return RadioMap(low, CELL_M, mean.reshape(-1, nx, ny), sd.reshape(-1, nx, ny), mapped)
+        sd[floor, k] = np.sqrt(np.maximum(whole - np.einsum("ij,ij->i", weights, cross), 1.0))
+    return RadioMap(low, CELL_M, mean.reshape(*shape[:2], nx, ny), sd.reshape(*shape[:2], nx, ny), mapped)
+
+
+def slab_loss_db(floors: NDArray[np.integer[Any]] | int, floor_db: float) -> FloatArray:
+    """Return the loss through the slabs of so many floors (dB): ``floor_db``, and :data:`FURTHER_DB` each further one.
+
+    At 2.4 GHz and in offices ``floor_db`` is 15 dB (ITU-R P.1238, table 3: 15 + 4 (n − 1)).
+    """
+    n = np.abs(np.asarray(floors))
+    return np.where(n > 0, floor_db + FURTHER_DB * (n - 1.0), 0.0) if floor_db > 0 else np.zeros(n.shape)
 
 
 def _design(anchors: Anchors, k: int, where: FloatArray, up: FloatArray) -> FloatArray:
@@ -100,9 +138,9 @@ def _design(anchors: Anchors, k: int, where: FloatArray, up: FloatArray) -> Floa
     return np.column_stack([np.ones(len(where)), -5.0 * np.log10(np.maximum(square, 0.09))])
 
 
-def _common(designs: list[FloatArray], mine: list[FloatArray], alike: list[int]) -> FloatArray:
+def _common(designs: list[FloatArray], heard: list[FloatArray], alike: list[int]) -> FloatArray:
     """Return P_d0 and η of anchors taken together."""
-    rows, powers = np.vstack([designs[j] for j in alike]), np.concatenate([mine[j][:, 3] for j in alike])
+    rows, powers = np.vstack([designs[j] for j in alike]), np.concatenate([heard[j] for j in alike])
     return np.asarray(np.linalg.lstsq(rows, powers, rcond=None)[0], dtype=np.float64)
 
 

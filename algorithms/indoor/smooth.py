@@ -12,11 +12,11 @@ import numpy as np
 import polars as pl
 
 from ..contract import FloatArray, IntArray, Message, PlainEstimator, Remark, Result
+from .cloud import Cloud, scatter
 from .fused import IndoorFused, IndoorFusedParams
-from .particles import Cloud, scatter
 from .steps import detect_steps
 
-STEPS, ACCELERATIONS, ORIENTATIONS = 2, 3, 4
+STEPS, ACCELERATIONS, ORIENTATIONS, PRESSURES = 2, 3, 4, 5
 """Inputs of ``indoor.fused`` by number."""
 
 
@@ -46,6 +46,8 @@ class IndoorSmooth(PlainEstimator):
         self.back.start(context)
         cloud: Cloud = self.back.state
         p = self.params
+        if len(self.back.storeys) > 1:
+            cloud.s["start_floor"] = -1
         scatter(
             cloud,
             math.nan,
@@ -53,7 +55,6 @@ class IndoorSmooth(PlainEstimator):
             p.start_sd_m,
             math.radians(p.heading_sd_deg),
             p.scale_sd,
-            self.back.offset_db,
         )
         self.kept: list[tuple[int, int, int, tuple[Any, ...]]] = []
 
@@ -126,7 +127,9 @@ class IndoorSmooth(PlainEstimator):
         self, inputs: Any, channels: Any, t_ns: IntArray, values: FloatArray, stepped: dict[int, float]
     ) -> dict[int, FloatArray]:
         """Return what the filter says that has only seen what comes after a time, by that time."""
-        keep = np.flatnonzero((inputs <= STEPS) | np.isin(np.arange(len(inputs)), list(stepped)))[::-1]
+        keep = np.flatnonzero(
+            (inputs <= STEPS) | (inputs == PRESSURES) | np.isin(np.arange(len(inputs)), list(stepped))
+        )[::-1]
         kinds, backward = inputs[keep].copy(), values[keep].copy()
         for row, m in enumerate(keep.tolist()):
             if m in stepped:
