@@ -1,8 +1,8 @@
 """Anchors of known position with the parameters of their signals, from what the recording and calibrations say.
 
 A recording has the attachment ``anchors.csv``: ``mac,technology,x,y,z,p_d0,eta,name,floor`` (m, dBm; cells may be
-empty and columns other than ``mac``, ``x``, ``y`` missing). The calibration ``radio`` has what was measured of them, and
-goes before the table. An anchor without parameters of its own gets the pooled ones of its technology, which is said.
+empty and columns other than ``mac``, ``x``, ``y`` missing). The calibration ``radio`` has what was measured, and
+goes before the table. An anchor without parameters of its own gets the pooled ones of its technology; that is said.
 """
 
 from __future__ import annotations
