@@ -124,9 +124,10 @@ def map_of(
 
 
 def slab_loss_db(floors: NDArray[np.integer[Any]] | int, floor_db: float) -> FloatArray:
-    """Return the loss through the slabs of so many floors (dB): ``floor_db``, and :data:`FURTHER_DB` each further one.
+    """Return the loss through slabs (dB): ``floor_db``, and :data:`FURTHER_DB` for each further one.
 
-    At 2.4 GHz and in offices ``floor_db`` is 15 dB (ITU-R P.1238, table 3: 15 + 4 (n − 1)).
+    At 2.4 GHz and in offices ``floor_db`` is 15 dB (ITU-R P.1238, table 3: 15 + 4 (n − 1)). ``floors``: how many are
+    between transmitter and receiver, shape (n,) or one.
     """
     n = np.abs(np.asarray(floors))
     return np.where(n > 0, floor_db + FURTHER_DB * (n - 1.0), 0.0) if floor_db > 0 else np.zeros(n.shape)
