@@ -178,6 +178,10 @@ def test_a_track_that_ran_away_does_not_set_the_frame() -> None:
     good = line(50)
     assert framed([good, away]) == [good]
     assert framed([away]) == [away]
+    short = Trace("s", "#000000")
+    short.add(np.arange(2), good.shown[[0, 8]])
+    more = [line(50), line(50)]
+    assert framed([short, *more, away]) == [short, *more]  # one that found half of the steps hides none
 
 
 @pytest.mark.parametrize(

@@ -126,10 +126,11 @@ class Trace:
 def framed(traces: Sequence[Trace]) -> list[Trace]:
     """Return the traces that a view should be zoomed to.
 
-    One that has run away (an uncorrected mechanization falls through the floor) must not hide the others.
+    One that has run away (an uncorrected mechanization falls through the floor) must not hide the others, nor one
+    that is too short: the lower median is the measure.
     """
-    walked = [t.size_m for t in traces if t.size_m > STANDING_M]
-    limit = LARGER * min(walked, default=np.inf)
+    walked = sorted(t.size_m for t in traces if t.size_m > STANDING_M)
+    limit = LARGER * walked[(len(walked) - 1) // 2] if walked else np.inf
     near = [t for t in traces if t.size_m <= limit and t.worst_m <= max(ASTRAY * t.size_m, STANDING_M)]
     return near or list(traces)
 
