@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -96,7 +97,8 @@ def emit_json(document: dict[str, Any]) -> None:
         text = msgspec.json.encode(document, enc_hook=plain)
     except UnicodeEncodeError:  # a file's name that is no UTF-8
         text = msgspec.json.encode(_encodable(document), enc_hook=plain)
-    sys.stdout.write(text.decode() + "\n")
+    # JSON leaves what turns the direction of writing, and C1, as they are: a terminal does not.
+    sys.stdout.write("".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text.decode()) + "\n")
 
 
 def _encodable(value: Any) -> Any:

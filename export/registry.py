@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..recording import Recording
-from ..recording.errors import UsageError
+from ..recording.errors import UsageError, overflow_unsaid
 from ..recording.files import require_other
 from ..recording.options import options_of
 from ..recording.plugins import plugins
@@ -59,12 +59,8 @@ def export(
     """
     chosen = _exporter(to)
     require_other(path, [rec.path])
-    return chosen().export(
-        rec,
-        Path(path),
-        _options(chosen, options),
-        overwrite=overwrite,
-    )
+    with overflow_unsaid():
+        return chosen().export(rec, Path(path), _options(chosen, options), overwrite=overwrite)
 
 
 def export_all(
@@ -92,13 +88,8 @@ def export_all(
     chosen = _exporter(to)
     together = getattr(chosen, "export_all", None)
     if together is not None:
-        return together(
-            chosen(),
-            recs,
-            Path(path),
-            _options(chosen, options),
-            overwrite=overwrite,
-        )
+        with overflow_unsaid():
+            return together(chosen(), recs, Path(path), _options(chosen, options), overwrite=overwrite)
     names = [rec.path.stem + chosen.suffix for rec in recs]
     if len(set(names)) != len(names):
         raise UsageError(f"{path}: two recordings would have one name; export them one by one")

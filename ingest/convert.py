@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
-import numpy as np
 import polars as pl
 
 from .. import recording as mr
-from ..recording.errors import MarchaError, OutputExists, UsageError
+from ..recording.errors import MarchaError, OutputExists, UsageError, overflow_unsaid
 from ..recording.files import as_unicode, require_other
 from ..recording.provenance import provenance
 from ..recording.threads import Prefetch, helpers
@@ -126,8 +125,7 @@ def convert(
     if out.exists() and not overwrite:
         raise OutputExists(out)
     with contextlib.ExitStack() as stack:
-        # A damaged number of 1e308 overflows where it is squared: what compares it then says no, as it should.
-        stack.enter_context(np.errstate(over="ignore", invalid="ignore"))
+        stack.enter_context(overflow_unsaid())
         recognised = registry.choose(
             sources, format, stack, mapped=mapped, unpack_limit_gb=unpack_limit(options or {})
         )

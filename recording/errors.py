@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import msgspec
@@ -72,3 +73,13 @@ class Finding(msgspec.Struct, frozen=True):
     def __post_init__(self) -> None:
         if len(self.detail) > MOST_CHARACTERS or not self.detail.isprintable():
             msgspec.structs.force_setattr(self, "detail", one_line(self.detail))
+
+
+def overflow_unsaid() -> AbstractContextManager[object]:
+    """Let NumPy say nothing of numbers that overflow, here and in helper threads.
+
+    A damaged number of 1e308 overflows where it is squared: what compares it then says no, as it should.
+    """
+    import numpy as np
+
+    return np.errstate(over="ignore", invalid="ignore")

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from ..algorithms.calibration import Calibration
 from ..recording import Recording
 from ..recording import open as open_recording
-from ..recording.errors import OutputExists
+from ..recording.errors import OutputExists, UsageError
 from ..recording.files import require_other
 from ..recording.provenance import hash_file
 from ..recording.threads import give_back_memory
 from .clock import Clock
 from .engine import Engine, Progress
-from .evaluate import evaluate, evaluate_run, recording_view, truth_of
+from .evaluate import evaluate, evaluate_run, recording_view, surveyed, truth_of
 from .gaps import GapPolicy, Gaps
 from .plan import EstimatorLike, plan_runs
 from .results import ReplayResult, Run
@@ -117,6 +119,8 @@ def replay(
         if target.exists() and not overwrite:
             raise OutputExists(target)
     if rec is not None and metrics:
+        if survey is not None:
+            surveyed(survey)
         truth_of(rec.metadata)  # what cannot be measured against is said before anything is written
     taken = [n.removeprefix("run/") for n in rec.metadata if n.startswith("run/")] if rec is not None else []
     taken += {t.split("/")[2] for t in source.channels if t.startswith("/estimate/") and t.count("/") > 2}
@@ -139,10 +143,11 @@ def replay(
             if tables is not None:
                 kept = {name: tables.table(topic) for name, topic in run.outputs.items()}
                 run.tables = {name: t for name, t in kept.items() if t is not None}
-                if metrics:
-                    view = recording_view(rec, run.lineage, run.tables, start_ns, end_ns, survey=survey)
-                    measured = evaluate_run(view)
-                    run.metrics, run.alignment = measured.metrics, measured.alignment
+                with _kept_unmeasured():
+                    if metrics:
+                        view = recording_view(rec, run.lineage, run.tables, start_ns, end_ns, survey=survey)
+                        measured = evaluate_run(view)
+                        run.metrics, run.alignment = measured.metrics, measured.alignment
 
     engine = Engine(
         source,
@@ -174,9 +179,18 @@ def replay(
         for run in result.runs:
             run.annotations = run.annotations.clear()
         give_back_memory()
-        with open_recording(target) as written:
+        with _kept_unmeasured(), open_recording(target) as written:
             evaluation = evaluate(written, runs=[r.run for r in result.runs], intervals=False, survey=survey)
-        evaluated = {r.run: r for r in evaluation.runs}
-        for run in result.runs:
-            run.metrics, run.alignment = evaluated[run.run].metrics, evaluated[run.run].alignment
+            evaluated = {r.run: r for r in evaluation.runs}
+            for run in result.runs:
+                run.metrics, run.alignment = evaluated[run.run].metrics, evaluated[run.run].alignment
     return result
+
+
+@contextlib.contextmanager
+def _kept_unmeasured() -> Iterator[None]:
+    """Keep a replay that cannot be measured without a choice of the user's: of several references, say."""
+    try:
+        yield
+    except UsageError as error:
+        warnings.warn(f"not measured: {error}; `marcha evaluate` takes it", stacklevel=4)

@@ -294,12 +294,12 @@ def recording_view(
         alignment=alignment or usual_alignment(rec, lineage, track),
         max_gap_s=max_gap_s,
         reference_frame=rec.channels[track].frame_id if rec is not None and track is not None else "",
-        survey=None if survey is None else _surveyed(survey),
+        survey=None if survey is None else surveyed(survey),
         stream=stream if tables is None else None,
     )
 
 
-def _surveyed(rec: Recording) -> pl.DataFrame:
+def surveyed(rec: Recording) -> pl.DataFrame:
     """Return the places of a survey."""
     fixes = [
         t for t, c in rec.channels.items() if c.schema in KINDS["fix"] and not t.startswith("/estimate/")
@@ -482,7 +482,7 @@ def _measure(view: RunView) -> dict[str, float]:
 def _matched(view: RunView) -> tuple[int, int]:
     compared = view.comparison
     if compared is None:
-        return 0, len(view.track) if view.track is not None and view.reference is not None else 0
+        return 0, len(view.track) if view.reference is not None and view.track is not None else 0
     return len(compared.matches.index), compared.matches.dropped
 
 

@@ -17,7 +17,6 @@ from ..algorithms.contract import FloatArray
 from ..recording import rotations
 from ..recording.plugins import plugins
 from .alignment import IntArray, Transform, match, wrap
-from .trajectory import inside
 from .view import VELOCITY, RunView
 
 Metric = Callable[[RunView], Mapping[str, float]]
@@ -27,10 +26,10 @@ BETWEEN = "(between)"
 
 def closure(view: RunView) -> dict[str, float]:
     """Distance from start to end, horizontal (the source's EP, eq 4.3, times the length)."""
-    if view.track is None or view.scattered:
+    if view.ends is None:
         return {}
-    way = view.track.position[-1] - view.track.position[0]
-    metres = float(np.hypot(way[0], way[1]))
+    east, north, _ = view.ends[1] - view.ends[0]
+    metres = float(np.hypot(east, north))
     metrics = {"closure_m": metres}
     if view.truth.closed and view.truth.length_m:
         metrics["closure_percent"] = 100.0 * metres / view.truth.length_m
@@ -49,22 +48,16 @@ def distance(view: RunView) -> dict[str, float]:
         if view.truth.steps:
             metrics["steps_difference"] = steps.height - view.truth.steps
             metrics["steps_error_percent"] = 100.0 * abs(steps.height - view.truth.steps) / view.truth.steps
-    base = view.whole or view
-    track = base.track
-    if track is None:
+    way = view.way
+    if way is None:
         return metrics
-    first, last = track.t_ns[0], track.t_ns[-1]
-    stances = base.stances[(base.stances[:, 1] >= first) & (base.stances[:, 0] <= last)]
-    # The track begins within the rest at the start: that stance counts from where there is a track.
-    middles = np.clip(stances, first, last).mean(axis=1).astype(np.int64)
-    rows = np.searchsorted(track.t_ns, middles)
-    if rows.size:
-        metrics["distance_m"] = _length(middles, track.position[rows], view.spans)
+    if way.stances_m is not None:
+        metrics["distance_m"] = way.stances_m
     elif (
         steps is not None and "length_m" in steps.columns and np.isfinite(steps["length_m"].to_numpy()).all()
     ):
         metrics["distance_m"] = float(steps["length_m"].sum())
-    metrics["path_m"] = _length(track.t_ns, track.position, view.spans)
+    metrics["path_m"] = way.length_m
     if (length := view.truth.length_m) is not None:
         if "distance_m" in metrics:
             metrics["distance_difference_m"] = metrics["distance_m"] - length
@@ -77,25 +70,11 @@ def distance(view: RunView) -> dict[str, float]:
     return metrics
 
 
-def _length(t_ns: IntArray, position: FloatArray, spans: IntArray | None) -> float:
-    """Return the horizontal length of a polygon; in stretches of time, of the sides whose middle is in them."""
-    block = 1 << 17  # the differences of a long walk need not lie in memory together
-    total = 0.0
-    for i in range(0, max(1, len(position) - 1), block):
-        side = np.hypot(*np.diff(position[i : i + block + 1, :2], axis=0).T)
-        if spans is not None:
-            before, after = t_ns[i : i + len(side)], t_ns[i + 1 : i + 1 + len(side)]
-            side = side[inside(before + (after - before) // 2, spans)]
-        total += float(side.sum())
-    return total
-
-
 def height(view: RunView) -> dict[str, float]:
     """Height at the end over the start, signed (the source's EA, eq 4.5, is its absolute value)."""
-    if view.track is None or view.scattered:
+    if view.ends is None:
         return {}
-    z = view.track.position[:, 2]
-    metrics = {"height_end_m": float(z[-1] - z[0])}
+    metrics = {"height_end_m": float(view.ends[1, 2] - view.ends[0, 2])}
     if view.truth.closed:
         metrics["height_error_m"] = abs(metrics["height_end_m"])
     return metrics
@@ -180,7 +159,8 @@ def _attitude_error(view: RunView, t_ns: IntArray, transform: Transform) -> Floa
     None where a side has no orientation, or where the reference's body is not the sensor's (markers on a shoe, say):
     its constant offset is not known, and fitting it would hide the tilt at the start.
     """
-    track, reference = view.track, view.reference_track
+    reference = view.reference_track
+    track = None if reference is None else view.track
     if track is None or reference is None or track.quat_wxyz is None or reference.quat_wxyz is None:
         return None
     mine = np.searchsorted(track.t_ns, t_ns)

@@ -77,7 +77,9 @@ def reference_of(
             return own[0]
     fitting = [t for t in fitting if not t.startswith(DEVICE)] or fitting
     if len(fitting) > 1:
-        raise UsageError(f"{name}: several references ({', '.join(fitting)}) for {input_topic}; name one")
+        raise UsageError(
+            f"{name}: several references ({', '.join(fitting)}) for {input_topic}; name one (--reference)"
+        )
     return fitting[0] if fitting else None
 
 

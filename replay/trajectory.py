@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -119,6 +119,112 @@ def track_of_stream(rows: int, tables: Iterator[pl.DataFrame], headings: bool) -
         return None
     quat = values[:n, 3:] if headings and np.isfinite(values[:n, 3:]).all() else None
     return Trajectory(t_ns[:n], values[:n, :3], quat)
+
+
+@dataclass(frozen=True)
+class Way:
+    """What a track is measured by where nothing is compared with it: a few numbers instead of every sample.
+
+    Attributes
+    ----------
+    ends : ndarray, shape (2, 3)
+        First and last position (m).
+    length_m : float
+        Horizontal length along every sample.
+    stances_m : float or None
+        Horizontal length from the middle of each stance to that of the next; None where there is no stance.
+    """
+
+    ends: FloatArray
+    length_m: float
+    stances_m: float | None
+
+
+def way_of(
+    pieces: Iterable[Trajectory], stances: IntArray, last_ns: int | None = None, spans: IntArray | None = None
+) -> Way | None:
+    """Return the way of a track that comes piece by piece, in order.
+
+    Parameters
+    ----------
+    pieces : iterable of Trajectory
+        Pieces with at least a sample each.
+    stances : ndarray of int64, shape (n, 2)
+        First and last still time (ns). The track begins within the rest at the start: that stance counts from
+        where there is a track.
+    last_ns : int, optional
+        Time at the end of the track, where a stance that goes on beyond it ends. Without it there is no way
+        where one does.
+    spans : ndarray of int64, shape (k, 2), optional
+        Stretches of time (ns, half open): only sides of the polygon whose middle is in one are counted.
+    """
+    first = last = None
+    middles, places, length, n = np.empty(0, np.int64), [], 0.0, 0
+    for piece in pieces:
+        t, position = piece.t_ns, piece.position
+        if first is None:
+            first = piece
+            stances = stances[stances[:, 1] >= t[0]]
+            if last_ns is not None:
+                stances = stances[stances[:, 0] <= last_ns]
+            middles = np.clip(stances, t[0], last_ns).mean(axis=1).astype(np.int64)
+        if last is not None:
+            t, position = np.r_[last.t_ns[-1:], t], np.vstack((last.position[-1:], position))
+        length += polygon_m(t, position, spans)
+        upto = n + int(np.searchsorted(middles[n:], t[-1], side="right"))
+        places.append(position[np.searchsorted(t, middles[n:upto])])
+        n, last = upto, piece
+    if first is None or last is None:
+        return None
+    if last_ns is None:
+        if (stances[stances[:, 0] <= last.t_ns[-1], 1] > last.t_ns[-1]).any():
+            return None
+        middles = middles[:n]
+    stood = np.concatenate(places)
+    return Way(
+        np.vstack((first.position[0], last.position[-1])),
+        length,
+        polygon_m(middles, stood, spans) if len(stood) else None,
+    )
+
+
+def polygon_m(t_ns: IntArray, position: FloatArray, spans: IntArray | None) -> float:
+    """Return the horizontal length of a polygon; in stretches of time, of the sides whose middle is in them.
+
+    Shapes: ``t_ns`` (n,), ``position`` (n, 3), ``spans`` (k, 2).
+    """
+    block = 1 << 17  # the differences of a long walk need not lie in memory together
+    total = 0.0
+    for i in range(0, max(1, len(position) - 1), block):
+        side = np.hypot(*np.diff(position[i : i + block + 1, :2], axis=0).T)
+        if spans is not None:
+            before, after = t_ns[i : i + len(side)], t_ns[i + 1 : i + 1 + len(side)]
+            side = side[inside(before + (after - before) // 2, spans)]
+        total += float(side.sum())
+    return total
+
+
+def in_order(tables: Iterable[pl.DataFrame]) -> Iterator[Trajectory]:
+    """Yield the usable rows of pieces of a pose table; :class:`OutOfOrderError` where they are not in order."""
+    before = -(2**63)
+    for table in tables:
+        t_ns = table["t_ns"].to_numpy()
+        if not set(POSITION) <= set(table.columns):
+            raise OutOfOrderError
+        position = table.select(POSITION).to_numpy(order="c")
+        good = np.isfinite(position).all(axis=1)
+        if not good.all():
+            t_ns, position = t_ns[good], position[good]
+        if not len(t_ns):
+            continue
+        if t_ns[0] <= before or not (np.diff(t_ns) > 0).all():
+            raise OutOfOrderError
+        before = int(t_ns[-1])
+        yield Trajectory(t_ns, position)
+
+
+class OutOfOrderError(ValueError):
+    """A track cannot be read in pieces: times that repeat or go back, or no positions."""
 
 
 def with_stays(reference: Trajectory, max_gap_s: float) -> Trajectory:

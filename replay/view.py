@@ -6,6 +6,7 @@ over parts that make up the walk is what the whole says.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,8 +22,11 @@ from .references import own_record, reference_of, references
 from .trajectory import (
     POSITION,
     QUATERNION,
+    OutOfOrderError,
     Trajectory,
+    Way,
     flat,
+    in_order,
     inside,
     is_sparse,
     joined,
@@ -30,6 +34,7 @@ from .trajectory import (
     stepwise,
     track_of,
     track_of_stream,
+    way_of,
     with_stays,
 )
 
@@ -283,6 +288,38 @@ class RunView:
         return track if track is not None else track_of(self.table("position", POSITION))
 
     @cached_property
+    def way(self) -> Way | None:
+        """Ends and length of the track; read in pieces where nothing is to be compared with the track itself."""
+        if (
+            self.whole is None
+            and self.reference is None
+            and self.stream is not None
+            and "track" not in vars(self)
+        ):
+            arrays = self.stream("pose")
+            with contextlib.suppress(OutOfOrderError):
+                if arrays is not None and (way := way_of(in_order(arrays[1]), self.stances)) is not None:
+                    return way
+        track = (self.whole or self).track
+        if track is None:
+            return None
+        block = 1 << 17
+        pieces = (
+            Trajectory(track.t_ns[i : i + block], track.position[i : i + block])
+            for i in range(0, len(track), block)
+        )
+        return way_of(pieces, (self.whole or self).stances, int(track.t_ns[-1]), self.spans)
+
+    @property
+    def ends(self) -> FloatArray | None:
+        """First and last position (m), shape (2, 3); None without a track, or where several stretches are looked at."""
+        if self.scattered:
+            return None
+        if self.whole is None:
+            return None if self.way is None else self.way.ends
+        return None if self.track is None else self.track.position[[0, -1]]
+
+    @cached_property
     def reference_track(self) -> Trajectory | None:
         """The reference track."""
         return track_of(self._within(self.reference))
@@ -312,7 +349,8 @@ class RunView:
 
 def compare(view: RunView, alignment: str) -> Comparison | None:
     """Match a run's track with the reference and align it."""
-    track, reference = view.track, view.reference_track
+    reference = view.reference_track
+    track = None if reference is None else view.track
     if track is None or reference is None:
         return None
     if view.reference_frame == PLAN:

@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import json
 import os
 import re
 import signal
 import struct
 import subprocess
 import sys
+import warnings
 import zipfile
 from pathlib import Path
 
 import marcha.recording as mr
+import numpy as np
+import polars as pl
 import pytest
 from marcha import ingest
 from marcha.recording import MarchaError
 from marcha.recording.check import check
+from marcha.recording.definitions import full_text
 from mcap.opcode import Opcode
 
 from .cli_helpers import marcha
@@ -138,6 +143,60 @@ def test_a_recording_with_a_text_channel_is_viewed_and_exported(tmp_path: Path) 
     assert marcha("export", tmp_path / "a.mcap", "--to", "rrd", "-o", tmp_path / "b.rrd").code == 0
     assert (tmp_path / "a.rrd").stat().st_size > 0
     assert (tmp_path / "b.rrd").stat().st_size > 0
+
+
+MARKERS = "marcha_msgs/msg/OpticalMarkers"
+
+
+def test_markers_without_names_and_facts_that_are_no_numbers_are_drawn(tmp_path: Path) -> None:
+    """Rerun keeps the first type of a name for the whole process: the text came after the number."""
+    from marcha.viz import write_rrd
+
+    payload = struct.pack("<iII4sIII", 0, 1, 1, b"\0", 0, 0, 0)
+    with foreign(tmp_path / "a.mcap", full_text(MARKERS), payload, schema=MARKERS) as rec:
+        assert rec.channels["/x"].columns == ()
+        write_rrd(rec, tmp_path / "a.rrd")
+    for k, length in enumerate(("22.1", "twenty")):
+        with mr.create(tmp_path / f"{k}.mcap") as out:
+            out.add_table(
+                "/x", "sensor_msgs/msg/Temperature", pl.DataFrame({"t_ns": [1], "temperature_c": [20.0]})
+            )
+            out.add_metadata("subject", {"length_m": length, "": "x"})
+        with warnings.catch_warnings(), mr.open(tmp_path / f"{k}.mcap") as rec:
+            warnings.simplefilter("error")
+            write_rrd(rec, tmp_path / f"{k}.rrd")
+
+
+def imu_with_references(path: Path, references: tuple[str, ...]) -> Path:
+    t_ns = np.arange(500, dtype=np.int64) * 10**7 + 1
+    table = pl.DataFrame(
+        {"t_ns": t_ns, **{f"{s}_{a}": np.sin(t_ns / 1e8) for s in ("acc", "gyr") for a in "xyz"}}
+    )
+    zero = {f"pos_{a}": np.zeros(500) for a in "xyz"}
+    with mr.create(path) as out:
+        out.add_table("/foot/imu1", "sensor_msgs/msg/Imu", table)
+        for topic in references:
+            out.add_table(topic, "geometry_msgs/msg/PointStamped", pl.DataFrame({"t_ns": t_ns, **zero}))
+    return path
+
+
+def test_a_replay_is_kept_where_several_references_fit(tmp_path: Path) -> None:
+    rec = imu_with_references(tmp_path / "a.mcap", ("/reference/a/position", "/reference/b/position"))
+    done = marcha("replay", rec, "-e", "foot.naive", "-o", tmp_path / "b.mcap")
+    assert done.code in (0, 3)
+    assert "name one (--reference)" in done.err
+    said = marcha("evaluate", tmp_path / "b.mcap")
+    assert said.code == 2
+    assert "name one (--reference)" in said.complaint
+
+
+def test_json_holds_no_sign_that_turns_the_direction_of_writing(tmp_path: Path) -> None:
+    rec = imu_with_references(tmp_path / "a.mcap", ())
+    marked = tmp_path / "b.mcap"
+    assert marcha("annotate", "add", rec, "--label", "\u202ex\x9bé", "--from", "1", "-o", marked).code == 0
+    done = marcha("annotate", "list", marked, "--json")
+    assert done.out.rstrip("\n").isprintable()
+    assert "\u202ex\x9bé" in json.dumps(done.document, ensure_ascii=False)
 
 
 def test_every_package_says_that_it_is_typed() -> None:

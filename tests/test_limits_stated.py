@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from marcha.replay.trajectory import stances_of, track_of, track_of_stream
+from marcha.replay.trajectory import OutOfOrderError, in_order, stances_of, track_of, track_of_stream, way_of
 
 from .conftest import ROOT
 
@@ -48,6 +48,44 @@ def test_a_track_read_in_pieces_is_the_track_of_its_table(rows: int, headings: b
     assert (whole.quat_wxyz is None) == (streamed.quat_wxyz is None)
     if whole.quat_wxyz is not None and streamed.quat_wxyz is not None:
         assert np.array_equal(whole.quat_wxyz, streamed.quat_wxyz)
+
+
+@pytest.mark.parametrize("rows", [1, 7, 1000])
+def test_a_way_read_in_pieces_is_that_of_the_track(rows: int) -> None:
+    rng = np.random.default_rng(1)
+    names = ["pos_x", "pos_y", "pos_z"]
+    t_ns = np.arange(300) * 10**7 + 5 * 10**8
+    table = pl.DataFrame({"t_ns": t_ns, **{n: rng.normal(size=300) for n in names}})
+    table = table.with_columns(
+        pl.when(pl.col("t_ns") % 13 == 0).then(float("nan")).otherwise("pos_y").alias("pos_y")
+    )
+    track = track_of(table)
+    assert track is not None
+    stances = np.array([[0, 1], [3, 55], [60, 60], [70, 140], [200, 220], [400, 500]]) * 10**7
+    whole, last = way_of([track], stances, int(track.t_ns[-1])), track.t_ns[-1]
+    way = way_of(in_order(pieces(table, rows)), stances)
+    assert whole is not None
+    assert way is not None
+    assert np.array_equal(way.ends, track.position[[0, -1]])
+    assert np.array_equal(way.ends, whole.ends)
+    side = np.hypot(*np.diff(track.position[:, :2], axis=0).T)
+    assert way.length_m == pytest.approx(side.sum())
+    middles = [(50 + 55) / 2, 60, 105, 210]
+    places = track.position[np.searchsorted(track.t_ns, np.array(middles) * 10**7), :2]
+    assert way.stances_m == pytest.approx(np.hypot(*np.diff(places, axis=0).T).sum())
+    assert whole.stances_m == pytest.approx(way.stances_m)
+    beyond = np.vstack((stances[:5], [[last - 10**7, last + 10**9]]))
+    assert way_of(in_order(pieces(table, rows)), beyond) is None  # its middle is known from the end alone
+    ended = way_of([track], beyond, int(last))
+    assert ended is not None
+    assert ended.stances_m is not None
+    assert ended.stances_m > (way.stances_m or 0.0)
+
+
+def test_a_way_whose_time_repeats_is_not_read_in_pieces() -> None:
+    table = pl.DataFrame({"t_ns": [0, 1, 1], **{f"pos_{a}": [0.0, 1.0, 2.0] for a in "xyz"}})
+    with pytest.raises(OutOfOrderError):
+        way_of(in_order([table]), np.empty((0, 2), np.int64))
 
 
 def test_a_track_whose_time_repeats_is_not_read_in_pieces() -> None:
@@ -89,6 +127,7 @@ def test_a_walk_without_a_reference_is_measured_without_its_large_tables(
             return real(self, topic, *more, **named)  # type: ignore[arg-type]
 
         monkeypatch.setattr(mr.Recording, "table", table)
+        monkeypatch.setattr("marcha.replay.view.track_of_stream", None)  # the track is not held either
         evaluate(rec)
     read = {t.rpartition("/")[2] for t in asked if t.startswith("/estimate/")}
     assert not read & {"sigma", "pose", "velocity", "detector", "attitude"}, read

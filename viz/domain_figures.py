@@ -318,7 +318,9 @@ def joints(rec: Recording, fig: Figure) -> None:
     for joint, topics in angles.items():
         ax = next(axes)
         curves: dict[str, Curve] = {}
-        for topic in sorted(topics, key=lambda t: ("reference", "raw", "estimate").index(role_of(t))):
+        for topic in sorted(
+            topics, key=lambda t: ("reference", "annotation", "raw", "estimate").index(role_of(t))
+        ):
             table, curves[topic] = rec.table(topic), Curve()
             values = np.degrees(table[joint].to_numpy())
             curves[topic].add(table["t_ns"].to_numpy(), values)

@@ -126,21 +126,36 @@ def send_facts(
     """
     begin = f"{prefix[1:]} " if prefix else ""
     for name in OF_THE_WALK:
-        facts: dict[str, Any] = {printable(k): _fact(v) for k, v in rec.metadata.get(name, {}).items()}
+        texts = {
+            printable(k): v for k, v in rec.metadata.get(name, {}).items() if k
+        }  # Rerun knows no empty name
+        facts: dict[str, Any] = {k: _of_one_type(k, _fact(v)) for k, v in texts.items()}
         if facts:
             stream.send_property(f"{begin}{name}", rr.AnyValues(**facts))
     for run in metrics.runs if not isinstance(metrics, str) else ():
-        values: dict[str, Any] = dict(run.metrics)
+        values: dict[str, Any] = {k: _of_one_type(k, v) for k, v in run.metrics.items()}
         if values:
             stream.send_property(f"{begin}metrics {run.run}", rr.AnyValues(**values))
 
 
 def _fact(text: str) -> float | str:
-    """Return a number as one: Rerun wants one type a name, and metrics of the same name are numbers."""
+    """Return a number as one: recordings are sorted by it."""
     try:
         return float(text)
     except ValueError:
         return printable(text)
+
+
+_TYPES: dict[str, type] = {}
+"""The first type that was sent under a name: Rerun keeps it for the whole process."""
+
+
+def _of_one_type(name: str, value: float | str) -> float | str:
+    """Return a fact in the type of its name: a text where numbers are is missing."""
+    kind = _TYPES.setdefault(name, type(value))
+    if isinstance(value, kind):
+        return value
+    return str(value) if kind is str else float("nan")
 
 
 def prefixes_of(recs: Sequence[Recording]) -> list[str]:

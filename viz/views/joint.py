@@ -409,6 +409,8 @@ class Markers(View):
         canvas.show("plot", self.heights, tab=RAW, panel=panel, owner=self.owner)
 
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
+        if not self.names:  # another program's markers, without names
+            return
         places = np.stack(
             [columns_of(block, [f"{n}.{a}" for a in "xyz"]) for n in self.names], axis=1
         )  # (rows, markers, 3)
