@@ -169,6 +169,17 @@ def prepare(source: StudyRecording, folder: Path) -> Path:
     return path
 
 
+def _survey(source: StudyRecording, folder: Path) -> Recording | None:
+    """Return the survey of a recording's route, converted once where it is a raw log."""
+    if not source.survey:
+        return None
+    path = Path(source.survey)
+    if path.suffix == ".mcap":
+        return open_recording(path)
+    name = f"survey-{path.stem}"
+    return open_recording(prepare(StudyRecording(name, "raw", source.digest, str(path)), folder))
+
+
 def _with_truth(source: StudyRecording, path: Path) -> None:
     """Copy a recording and add what the study knows about its walk."""
     rec = open_recording(source.path)
@@ -221,12 +232,14 @@ def _run(rec: Recording, task: StudyTask, jobs: Sequence[Job], topics: list[str]
         for number, job in enumerate(jobs)
     ]
     kept_back = stretches(task.withhold, rec)
+    survey = _survey(source, Path(task.folder))
     if task.by:
         with scratch_folder() as folder:
-            result = replay(rec, specs, inputs=topics, out=folder / "done.mcap", withhold=kept_back)
+            out = folder / "done.mcap"
+            result = replay(rec, specs, inputs=topics, out=out, withhold=kept_back, survey=survey)
             by_label = _by_label(open_recording(folder / "done.mcap"), task.by)
     else:
-        result, by_label = replay(rec, specs, inputs=topics, withhold=kept_back), {}
+        result, by_label = replay(rec, specs, inputs=topics, withhold=kept_back, survey=survey), {}
     imported = _import_findings(rec)
     cells: list[StudyCell] = []
     for run in result.runs:

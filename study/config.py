@@ -51,9 +51,12 @@ class TruthRule(_Table, frozen=True, kw_only=True):
         Whether the walk ends where it began.
     length_m : float or None
         True length in metres.
+    survey : str
+        File of fixes along the same route at another time, beside the walk or below its folder.
     """
 
     pattern: str = ""
+    survey: str = ""
     closed: bool | None = None
     length_m: Annotated[float, msgspec.Meta(gt=0)] | None = None
 
@@ -411,9 +414,8 @@ def check(config: StudyConfig, name: str) -> StudyConfig:
         if count > 1:
             raise no(f"{' '.join(filter(None, key))} occurs twice; give one of them another label")
     titles = [metric_title(m) for m in config.metrics]
-    for title in titles:
-        if titles.count(title) > 1:
-            raise no(f"metric title {title!r} occurs twice")
+    if twice := next((t for t in titles if titles.count(t) > 1), ""):
+        raise no(f"metric title {twice!r} occurs twice")
     for table in config.published:
         if table.metric not in titles:
             raise no(f"published: metric {table.metric!r} is none of {', '.join(titles)}")
@@ -488,8 +490,7 @@ def configuration(config: StudyConfig, name: str, topic: str) -> str:
     A file that no rule fits is ``other``.
     """
     for rule in config.configurations:
-        match = re.search(rule.pattern, name)
-        if match and fnmatchcase(topic, rule.input):
+        if (match := re.search(rule.pattern, name)) and fnmatchcase(topic, rule.input):
             return match.expand(rule.label)
     return "other" if config.configurations else "all"
 

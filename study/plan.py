@@ -52,6 +52,8 @@ class StudyRecording(msgspec.Struct, frozen=True):
         the study's rules decide.
     size : int
         Bytes, for ordering.
+    survey : str
+        File of a survey of its route; empty for none.
     """
 
     name: str
@@ -65,6 +67,7 @@ class StudyRecording(msgspec.Struct, frozen=True):
     seed: int = 0
     configuration: str = ""
     size: int = 0
+    survey: str = ""
 
 
 class Job(msgspec.Struct, frozen=True):
@@ -165,7 +168,10 @@ def find_sources(
     notes: list[str] = []
     if config.recordings is not None:
         files, notes = _files(config.recordings, data)
+        surveys = {path.parent / rule.survey for _, path in files for rule in config.recordings.truth}
         for name, path in files:
+            if path in surveys:
+                continue  # beside the walks, and none itself
             sources.append(_source(config.recordings, name, path, code))
     if config.simulate is not None:
         sources += _walks(config.simulate, code)
@@ -230,12 +236,14 @@ def _left_out(root: Path, paths: Sequence[Path]) -> list[Path]:
 def _source(recordings: cfg.Recordings, name: str, path: Path, code: str) -> StudyRecording:
     raw = path.suffix != ".mcap"
     beside = sorted(path.parent.glob(f"{glob.escape(path.stem)}.truth.*")) if raw else []
-    facts = (
-        cfg.TruthRule() if beside else cfg.truth(recordings, path.name)
-    )  # what a walk knows of itself counts
+    rule = cfg.truth(recordings, path.name)
+    facts = cfg.TruthRule() if beside else rule  # what a walk knows of itself counts
     truth = {k: v for k, v in (("closed", facts.closed), ("length_m", facts.length_m)) if v is not None}
     options = recordings.options if raw else {}
-    content = [file_digest(p) for p in (path, *beside)]
+    survey = path.parent / rule.survey if rule.survey else None
+    if survey is not None and not survey.is_file():
+        raise UsageError(f"{survey}: no such file; it is the survey of {path.name} in [[recordings.truth]]")
+    content = [file_digest(p) for p in (path, *beside, *([survey] if survey else []))]
     return StudyRecording(
         name=name,
         kind="raw" if raw else "mcap",
@@ -245,6 +253,7 @@ def _source(recordings: cfg.Recordings, name: str, path: Path, code: str) -> Stu
         options=options,
         truth=truth,
         size=path.stat().st_size,
+        survey="" if survey is None else str(survey.resolve()),
     )
 
 

@@ -27,6 +27,8 @@ from marcha.study.config import Metric, Recordings
 from marcha.study.plan import find_sources
 from marcha.study.withheld import Withheld
 
+from .phone_samples import rtk_pos, sensor_logger, short_walk
+
 CONFIG = """
 title = "Two <filters> & two sensors"
 inputs = ["/foot/imu1"]
@@ -325,6 +327,34 @@ def test_truth_of_the_study_reaches_recordings_that_lack_it(finished: StudyResul
     result = run_study(msgspec.toml.decode(text, type=StudyConfig), tmp_path / "out", data=data, workers=1)
     row = result.results.row(0, named=True)
     assert row["closure_percent"] == pytest.approx(100 * row["closure_m"] / 8.0)
+
+
+@pytest.mark.usefixtures("no_figures")
+def test_a_survey_of_the_route_is_what_tracks_are_measured_by(fixed_code: None, tmp_path: Path) -> None:
+    data = tmp_path / "data"
+    data.mkdir()
+    walk = short_walk()
+    sensor_logger(data / "walk", walk)
+    convert([data / "walk"], data / "walk.mcap")
+    shutil.rmtree(data / "walk")
+    rtk_pos(data / "route.pos", walk)
+    text = """
+    [recordings]
+    truth = [{ survey = "route.pos" }]
+    [[estimators]]
+    name = "phone.fused"
+    """
+    config = msgspec.toml.decode(text, type=StudyConfig)
+    result = run_study(config, tmp_path / "out", data=data, workers=1)
+    assert result.results["recording"].to_list() == ["walk"]
+    assert 0.0 <= result.results["line_median_m"][0] < 8.0
+    keys = [plan.jobs(config, find_sources(config, data, "code")[0][0])[0].key]
+    (data / "route.pos").write_text((data / "route.pos").read_text().replace("08:", "09:", 1) + "\n")
+    keys += [plan.jobs(config, find_sources(config, data, "code")[0][0])[0].key]
+    assert keys[0] != keys[1]  # another survey, another result
+    (data / "route.pos").unlink()
+    with pytest.raises(UsageError, match=r"route.pos: no such file; it is the survey of walk.mcap"):
+        find_sources(config, data, "code")
 
 
 def test_a_wrong_parameter_is_said_before_anything_runs(tmp_path: Path) -> None:
