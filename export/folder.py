@@ -43,15 +43,19 @@ def whole_folder(path: Path, *, overwrite: bool = False, marker: str = MARKER) -
     path = Path(os.path.abspath(path))
     _remove_leftovers(path)
     _may_be_created(path, overwrite, marker)
-    part = _new_part(path)
+    part = path
     try:
+        part = _new_part(path)
         yield part
         for file in sorted(p for p in part.rglob("*") if p.is_file()):
             _flush(file)
         _put(part, path, overwrite)
     except BaseException as error:
-        shutil.rmtree(part, ignore_errors=True)
-        if isinstance(error, OSError) and error.filename is None:  # a failed write does not know its file
+        if part != path:
+            shutil.rmtree(part, ignore_errors=True)
+        # A failed write does not know its file, and a hidden name says nothing.
+        hidden = path.with_name(f".{path.name}.")
+        if isinstance(error, OSError) and str(error.filename or hidden).startswith(str(hidden)):
             reason = error.strerror or " ".join(str(error).split())
             raise MarchaError(f"{path}: cannot write: {reason}; nothing was left there") from None
         raise

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from ..recording.errors import MarchaError
+from ..recording.files import files_below
 from . import registry
 from .archive import UNPACK_LIMIT_GB, is_zip, unpacked
 from .workbook import is_workbook
@@ -140,7 +141,7 @@ def _scan(
 
 def _files(folder: Path) -> list[Path]:
     """Return the files of a folder and below it, without hidden ones and those of macOS."""
-    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    files = files_below(folder)
     hidden = (
         any(part.startswith(".") or part == "__MACOSX" for part in f.relative_to(folder).parts) for f in files
     )

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ..recording.errors import MarchaError, UsageError
-from ..recording.files import require_regular
+from ..recording.files import files_below, require_regular
 from ..recording.options import options_of
 from ..recording.plugins import plugins
 from .archive import UNPACK_LIMIT_GB, is_zip, unpacked
@@ -294,7 +294,7 @@ def _resolve(
         if not path.stat().st_size:
             raise MarchaError(f"{path}: the file is empty; nothing to convert")
         raise MarchaError(f"{path}: {_known_otherwise(_head(path)) or f'unknown content; {_tried()}'}")
-    files = sorted(p for p in folder.rglob("*") if _is_data(p, folder))
+    files = [p for p in files_below(folder) if _is_data(p, folder)]
     if not files:
         raise MarchaError(f"{path}: the {'folder' if path.is_dir() else 'archive'} holds no files")
     parts = [(c[0].name, p) for p in files if (c := _candidates(p, wanted))]
@@ -342,7 +342,7 @@ def _known_otherwise(head: bytes) -> str:
 
 def _is_data(path: Path, folder: Path) -> bool:
     hidden = any(part.startswith(".") or part == "__MACOSX" for part in path.relative_to(folder).parts)
-    return path.is_file() and not hidden and not is_side_file(path)
+    return not hidden and not is_side_file(path)
 
 
 def _head(path: Path) -> bytes:

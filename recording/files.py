@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import stat
 from collections.abc import Iterable
 from pathlib import Path
@@ -29,6 +30,22 @@ def require_regular(path: Path) -> None:
         return
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise MarchaError(f"{path}: is a pipe, socket or device; write its content to a file and give that")
+
+
+def files_below(folder: Path) -> list[Path]:
+    """Return all files of a folder and of those in it, in order.
+
+    Raises
+    ------
+    MarchaError
+        One of the folders cannot be listed: what is in it would be left out without a word.
+    """
+
+    def refuse(error: OSError) -> None:
+        raise MarchaError(f"{error.filename}: cannot be read: {error.strerror}") from None
+
+    names = (Path(base) / n for base, _, files in os.walk(folder, onerror=refuse) for n in files)
+    return sorted(p for p in names if p.is_file())
 
 
 def require_other(out: Path | str, inputs: Iterable[Path]) -> None:

@@ -22,6 +22,7 @@ import msgspec
 from ..algorithms import available, make
 from ..algorithms.contract import AlgorithmError
 from ..recording import UsageError
+from ..recording.files import files_below
 from . import config as cfg
 from .withheld import Withheld
 
@@ -224,9 +225,8 @@ def _left_out(root: Path, paths: Sequence[Path]) -> list[Path]:
     taken = set(paths)
     return [
         p
-        for p in sorted(root.rglob("*"))
-        if p.is_file()
-        and p not in taken
+        for p in files_below(root)
+        if p not in taken
         and ".truth." not in p.name
         and p.suffix != ".toml"
         and not any(part.startswith(".") for part in p.relative_to(root).parts)

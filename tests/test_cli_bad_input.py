@@ -302,6 +302,7 @@ FULL = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000
 FULL_CASES = [*WRITERS] + [
     (f"export {to}", ("export", "IN", "--to", to, "-o", "OUT"), "out") for to in ("csv", "parquet")
 ]
+FULL_CASES.append(("simulate", ("simulate", "straight", "-o", "OUT"), "new"))
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs a limit of file sizes")
@@ -313,6 +314,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing(
     done = marcha_process(*given_, code=FULL)
     assert done.code == 1, done.err
     assert re.search("File too large|is the disk full", done.complaint)
+    assert done.complaint.startswith(f"{tmp_path / name}: ")
     assert list(tmp_path.iterdir()) == []
 
 

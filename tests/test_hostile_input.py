@@ -144,6 +144,32 @@ def test_pipes_and_devices_are_refused_not_read(tmp_path: Path, command: tuple[s
     assert "pipe, socket or device" in done.complaint
 
 
+@pytest.mark.parametrize(
+    "command", [("convert", "LOGS", "-o", "OUT/"), ("study", "STUDY", "--data", "LOGS", "-o", "OUT")]
+)
+def test_a_folder_that_may_not_be_listed_is_named_not_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
+) -> None:
+    real = os.scandir
+
+    def scandir(path: str | Path) -> object:
+        if str(path).endswith("secret"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return real(path)
+
+    (tmp_path / "logs" / "secret").mkdir(parents=True)
+    (tmp_path / "logs" / "walk.csv").write_text(GOOD)
+    (tmp_path / "study.toml").write_text(
+        '[recordings]\nfiles = ["*.csv"]\n[[estimators]]\nname = "foot.naive"\n'
+    )
+    monkeypatch.setattr(os, "scandir", scandir)
+    places = {"LOGS": tmp_path / "logs", "STUDY": tmp_path / "study.toml", "OUT": tmp_path / "out"}
+    done = marcha(*(places.get(a, a if a != "OUT/" else f"{tmp_path / 'out'}/") for a in command))
+    assert done.code == 1
+    assert done.complaint == f"{tmp_path / 'logs' / 'secret'}: cannot be read: Permission denied"
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.skipif(os.name != "posix", reason="names of files are Unicode here")
 def test_names_that_are_no_utf8_are_kept_as_escapes(tmp_path: Path) -> None:
     log, out = (os.fsdecode(os.fsencode(tmp_path) + b"/n\xff\xfe" + end) for end in (b".csv", b".mcap"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -34,6 +35,7 @@ def written_together(folder: Path, paths: Sequence[Path], *, overwrite: bool) ->
     for path in paths:
         if path.exists() and not overwrite:
             raise OutputExists(path)
+    new = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder, prefix=".marcha-") as made:
@@ -43,6 +45,8 @@ def written_together(folder: Path, paths: Sequence[Path], *, overwrite: bool) ->
                     shutil.rmtree(path)
                 (Path(made) / path.name).replace(path)
     except OSError as error:
-        raise MarchaError(
-            f"{error.filename or folder}: cannot write: {error.strerror or error}; nothing was written"
-        ) from error
+        if new:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        reason = error.strerror or " ".join(str(error).split())
+        raise MarchaError(f"{folder}: cannot write: {reason}; nothing was written") from error
