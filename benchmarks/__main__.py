@@ -25,6 +25,7 @@ MODULES = (
     "engine",
     "indoor",
     "phone",
+    "foot_consistency",
     "phone_consistency",
     "joint",
     "startup",

@@ -24,6 +24,7 @@ from matplotlib.ticker import LogFormatter
 from . import config as cfg
 from .analysis import order
 from .cells import StudyCell
+from .pairs import subsets
 from .report import NEES_TITLES
 from .statistics import normal_quantiles
 
@@ -129,7 +130,8 @@ def _scale(ax: Axes, frame: pl.DataFrame, log: bool) -> None:
     if log and len(values) and float(values.min()) > 0:  # pyright: ignore[reportArgumentType]
         _log_scale(ax)
     elif len(values) and float(values.min()) >= 0:  # pyright: ignore[reportArgumentType]
-        ax.set_ylim(bottom=0)
+        # The margin of a scale that begins at 0 is a share of all of it: the topmost marker is drawn whole.
+        ax.set_ylim(0, max(ax.get_ylim()[1], 1.06 * float(ax.dataLim.y1)))
 
 
 def box_by(frame: pl.DataFrame, config: cfg.StudyConfig, factor: str, log: bool = False) -> Figure:
@@ -183,19 +185,19 @@ def box_by_both(frame: pl.DataFrame, config: cfg.StudyConfig, log: bool = False)
 def qq(frame: pl.DataFrame, config: cfg.StudyConfig) -> Figure | None:
     """Normal Q-Q plot of one metric, a panel a configuration; None where every group is too small.
 
-    Values are standardized with their group's mean and standard deviation, so that all filters fit one panel.
+    Values are standardized with their group's mean and standard deviation, so that all filters fit one panel. Where
+    no configuration has walks enough, all configurations are one panel, clipped walks another one.
     """
     levels = order(frame, config)
     filters = levels["filter"]
     good = frame.filter(~pl.col("outlier") & pl.col("value").is_finite())
-    groups: dict[str, dict[str, np.ndarray]] = {}
-    for configuration in levels["configuration"]:
-        samples = _samples(good.filter(configuration=configuration), "filter", filters)
-        fitting = {
-            f: v for f, v in samples.items() if len(v) >= config.statistics.min_samples and np.ptp(v) > 0
+    parts = {c: good.filter(configuration=c) for c in levels["configuration"]}
+    groups = _fitting(parts, filters, config.statistics.min_samples)
+    if not groups:
+        parts = {
+            f"all configurations{'' if name == 'all' else f', {name}'}": part for name, part in subsets(good)
         }
-        if fitting:
-            groups[configuration] = fitting
+        groups = _fitting(parts, filters, config.statistics.min_samples)
     if not groups:
         return None
     columns = min(4, len(groups))
@@ -222,6 +224,20 @@ def qq(frame: pl.DataFrame, config: cfg.StudyConfig) -> Figure | None:
     figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False)
     figure.suptitle(f"Q-Q plots of {frame['metric'][0]}")
     return figure
+
+
+def _fitting(
+    parts: Mapping[str, pl.DataFrame], filters: Sequence[str], least: int
+) -> dict[str, dict[str, np.ndarray]]:
+    """Return the values by part and filter, of the groups that have ``least`` values and are not all alike."""
+    groups: dict[str, dict[str, np.ndarray]] = {}
+    for name, part in parts.items():
+        samples = {
+            f: v for f, v in _samples(part, "filter", filters).items() if len(v) >= least and np.ptp(v) > 0
+        }
+        if samples:
+            groups[name] = samples
+    return groups
 
 
 def tracks(cells: Sequence[StudyCell], config: cfg.StudyConfig) -> Figure | None:

@@ -162,10 +162,11 @@ def all_pairs(frame: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
 def verdicts(frame: pl.DataFrame, pairs: pl.DataFrame, config: cfg.StudyConfig) -> pl.DataFrame:
     """Say for every metric which combination has the smallest mean, and which may be equal to it.
 
-    The rule of the source: all that Welch's test, uncorrected, does not tell from the smallest mean.
+    The rule of the source: all that Welch's test, uncorrected, does not tell from the smallest mean. Where no
+    combination has walks enough for a test, the smallest mean is named and the note says so.
 
     Columns: ``metric, smallest, mean, equal`` (combinations, ``filter configuration``), ``published`` (those of
-    the publication) and ``same`` (yes, no; empty without a published verdict).
+    the publication), ``same`` (yes, no; empty without a published verdict or a test) and ``note``.
     """
     usable = _usable(frame)
     base = base_levels(order(usable, config), config)
@@ -173,10 +174,13 @@ def verdicts(frame: pl.DataFrame, pairs: pl.DataFrame, config: cfg.StudyConfig) 
     by_metric = {v.metric: v.smallest for v in config.verdicts}
     rows: list[dict[str, Any]] = []
     means = usable.filter(*at_base(base)).group_by("metric", "filter", "configuration", maintain_order=True)
-    table = means.agg(mean=pl.col("value").mean(), n=pl.len()).filter(
-        pl.col("n") >= config.statistics.min_samples
-    )
-    for (metric,), part in table.group_by("metric", maintain_order=True):
+    table = means.agg(mean=pl.col("value").mean(), n=pl.len())
+    least = config.statistics.min_samples
+    for (metric,), every in table.group_by("metric", maintain_order=True):
+        enough = every.filter(pl.col("n") >= least)
+        part = enough if len(enough) else every
+        largest = every.select(pl.col("n").max()).item()
+        note = "" if len(enough) else f"not tested: {largest} walks a combination at most, {least} needed"
         best = part.sort("mean").row(0, named=True)
         here = (best["filter"], best["configuration"])
         equal = [
@@ -197,10 +201,11 @@ def verdicts(frame: pl.DataFrame, pairs: pl.DataFrame, config: cfg.StudyConfig) 
                 "mean": best["mean"],
                 "equal": ", ".join(equal),
                 "published": ", ".join(published),
-                "same": "" if not published else "yes" if ours == published else "no",
+                "same": "" if note or not published else "yes" if ours == published else "no",
+                "note": note,
             }
         )
-    order_of = ("metric", "smallest", "mean", "equal", "published", "same")
+    order_of = ("metric", "smallest", "mean", "equal", "published", "same", "note")
     return pl.DataFrame(rows, schema={k: pl.Float64 if k == "mean" else pl.String for k in order_of})
 
 

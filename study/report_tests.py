@@ -92,7 +92,7 @@ def source(html: Html, contents: ReportContents) -> None:
             [
                 escape(r["metric"]),
                 f"{escape(r['smallest'])} ({number(r['mean'])})",
-                escape(r["equal"]) or "none",
+                escape(r["note"] or r["equal"]) or "none",
                 f"@published {escape(r['published']) or '–'}",
                 r["same"] or "–",
             ]

@@ -72,3 +72,19 @@ def test_one_filter_and_a_factor_have_one_over_all_configurations() -> None:
 
 def test_a_level_alone_has_none() -> None:
     assert not levels_of("foot-length", values(("15IEZ+ZARU",), ("pitch",), ("EP",)))
+
+
+def test_the_topmost_marker_is_drawn_whole() -> None:
+    frame = values(("15IEZ+ZARU",), ("c1c2c3", "pitch"), ("EP",)).with_columns(pl.col("value") + 50.0)
+    config, _ = load("foot-length")
+    (ax, *_) = figures.level_boxes(frame, config, "detector").axes
+    assert ax.get_ylim()[0] == 0
+    assert ax.get_ylim()[1] > 1.05 * np.max(frame["value"].to_numpy())
+
+
+def test_few_walks_a_configuration_have_one_q_q_plot_together() -> None:
+    frame = values(("9IEZ",), ("c1c2c3",), ("EP",)).filter(pl.col("recording").is_in(["walk0", "walk1"]))
+    config, _ = load("foot-tables")
+    drawn = figures.qq(frame, config)
+    assert drawn is not None
+    assert [ax.get_title() for ax in drawn.axes] == ["all configurations"]

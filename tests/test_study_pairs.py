@@ -114,6 +114,13 @@ def test_every_combination_is_compared_with_every_other_and_the_smallest_named()
     assert verdict["same"] == "no"
 
 
+def test_too_few_walks_name_the_smallest_mean_and_say_that_nothing_was_tested() -> None:
+    values = _two_configurations(frame(np.array([1.0, 1.2]), np.array([3.0, 3.1]), np.zeros(2, bool)))
+    (verdict,) = pairs.verdicts(values, pairs.all_pairs(values, CONFIG), CONFIG).to_dicts()
+    assert (verdict["smallest"], verdict["equal"], verdict["same"]) == ("A C0", "", "")
+    assert verdict["note"] == "not tested: 2 walks a combination at most, 3 needed"
+
+
 @pytest.mark.parametrize(("shift", "wanted"), [(1.0, "yes"), (-1.0, "no"), (0.0, "open")])
 def test_a_published_relation_reproduces_or_not(shift: float, wanted: str) -> None:
     """Published: A has half the error of B."""

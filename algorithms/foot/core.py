@@ -17,7 +17,7 @@ from ..numerics.compiled import compiled, inlined
 from ..numerics.records import Fields, record_type
 from ..numerics.rotations import quat_of
 from ..numerics.strapdown import NAVIGATION
-from . import rest
+from . import ceiling, rest
 from .detectors import DETECTOR, PITCH, decide
 from .detectors.pitch import start_tilt, track_tilt
 
@@ -79,6 +79,20 @@ VERDICT = record_type(
 )
 """What says whether the results can be a walk."""
 
+STANCE_VELOCITY = record_type(
+    ("change", "f8", (3,)),  # m/s, of the velocity by the accelerometer since the stance began, n
+    ("first", "f8", (3,)),  # what the rolling foot's velocity was then
+    ("count", "i8"),
+    ("total", "f8", (3,)),  # sum of the change beyond what rolling explains
+    ("squares", "f8", (3,)),
+    ("n", "i8"),  # stances of steps
+    ("variance", "f8", (3,)),  # m²/s², of that in a stance, mean over them
+    ("along", "f8", (2,)),  # direction of the newest step
+    ("way", "f8", (2,)),  # s, of walking in the directions of the steps, summed as vectors
+    ("time", "f8"),  # s, of walking
+)
+"""How far the velocity of the standing foot is from what its rolling explains, by its own accelerometer."""
+
 CORE: Fields = [
     *NAVIGATION,
     ("started", "?"),
@@ -96,9 +110,11 @@ CORE: Fields = [
     ("unknown_tilt", "f8"),  # variance of the tilt that an accelerometer's bias hides, rad²
     ("forward", "f8", (3,)),  # sum of the steps, each turned into b where it lands: the foot's direction
     ("lean", "f8", (2,)),  # of the horizontal position on the gyroscope's bias about the vertical, m s/rad
+    ("creep", STANCE_VELOCITY),
     ("steps", STEPS),
     ("verdict", VERDICT),
     ("rest", rest.REST),
+    ("ceiling", ceiling.CEILING),
     ("detector", DETECTOR),
 ]
 """Fields of every foot estimator's state, behind the filter's own.
@@ -148,6 +164,8 @@ def take(s: Any, ring: Any, row: FloatArray) -> bool:
     r.acc_norm = math.sqrt(x * x + y * y + z * z)
     x, y, z = r.gyr[0], r.gyr[1], r.gyr[2]
     r.gyr_norm = math.sqrt(x * x + y * y + z * z)
+    for i in range(3):
+        r.doubt[i] = 0.0
     if rest.watch(s.rest, r, k, s.time):
         start_tilt(s.detector.pitch, s.rest.acc)
     if s.rest.index < 0:
@@ -156,6 +174,8 @@ def take(s: Any, ring: Any, row: FloatArray) -> bool:
         track_tilt(s.detector.pitch, s.rest.gyr, r)
     s.decided = k
     decide(s.detector, ring, k, k)
+    if s.ceiling.on:
+        ceiling.watch(s.ceiling, ring, k, s.released)
     return k >= s.detector.latency
 
 
@@ -243,6 +263,10 @@ def _note_verdict(s: Any, r: Any) -> None:
     """Note what the sample ``r`` says of the plausibility of the run."""
     v = s.verdict
     v.navigated_s += r.dt
+    if s.stance_s <= LONGEST_STANCE_S and s.steps.count > 0:
+        s.creep.time += r.dt
+        for i in range(2):
+            s.creep.way[i] += s.creep.along[i] * r.dt
     s.lean[0] -= v.navigated_s * s.vel[1] * r.dt
     s.lean[1] += v.navigated_s * s.vel[0] * r.dt
     speed = s.vel[0] * s.vel[0] + s.vel[1] * s.vel[1] + s.vel[2] * s.vel[2]
@@ -297,6 +321,40 @@ def _count_swings(v: Any, r: Any) -> None:
         v.swings += 1
 
 
+LONGEST_STANCE_S = 0.5
+"""s: a foot that is still for longer stands; it does not roll on."""
+FEWEST_IN_STANCE = 4
+
+
+@compiled
+def _note_creep(s: Any, r: Any) -> None:
+    """Note how the sensor's velocity changes in a stance, beyond what the rolling foot explains.
+
+    ``s.stance_vel`` is what it explains. What changes by so much within a stance is not known better on the whole
+    of it: shoe and foot give, and the same way in every stance. No later stance shows that error.
+    """
+    c = s.creep
+    if s.stance_s <= r.dt:
+        if c.count >= FEWEST_IN_STANCE and s.steps.count > 0:
+            c.n += 1
+            for i in range(3):
+                average = c.total[i] / c.count
+                c.variance[i] += (c.squares[i] / c.count - average * average - c.variance[i]) / c.n
+        c.count = 0
+        for i in range(3):
+            c.total[i] = 0.0
+            c.squares[i] = 0.0
+            c.change[i] = 0.0
+            c.first[i] = s.stance_vel[i]
+    elif s.stance_s <= LONGEST_STANCE_S:
+        c.count += 1
+        for i in range(3):
+            c.change[i] += s.acc_n[i] * r.dt
+            change = c.change[i] - s.stance_vel[i] + c.first[i]
+            c.total[i] += change
+            c.squares[i] += change * change
+
+
 @inlined
 def judge_innovation(s: Any, r: Any, vel: int, variance: float) -> None:
     """Compare the velocity at the first sample of a stance with what P and R (``variance``) expect.
@@ -304,6 +362,7 @@ def judge_innovation(s: Any, r: Any, vel: int, variance: float) -> None:
     Call it before the update. ``vel`` is the first error state of the velocity, ``s.stance_vel`` what the standing
     foot's is taken for.
     """
+    _note_creep(s, r)
     if s.stance_s > r.dt:
         return
     square = 0.0
@@ -334,6 +393,10 @@ def _land(s: Any, out: FloatArray) -> None:
     out[STEP + 4] = math.atan2(y, x)
     steps.count += 1
     verdict.steps_m += length
+    s.creep.along[0], s.creep.along[1] = x, y
+    horizontal = math.sqrt(x * x + y * y)
+    for i in range(2):
+        s.creep.along[i] /= max(horizontal, 1e-9)
     for i in range(3):
         steps.landing[i] = pos[i]
         s.forward[i] += s.rot[0, i] * x + s.rot[1, i] * y
@@ -343,12 +406,16 @@ def _land(s: Any, out: FloatArray) -> None:
 def emit_sigma(s: Any, pos: int, vel: int, att: int, out: FloatArray) -> None:
     """Write the standard deviations of position, velocity and attitude, by their first error states.
 
-    Two errors are considered, not estimated. ``s.unknown_bias`` is the variance of a gyroscope bias that is no
+    Three errors are considered, not estimated. ``s.unknown_bias`` is the variance of a gyroscope bias that is no
     error state: what it does to heading and horizontal position is added (every stance takes its effect on the
     tilt out). ``s.unknown_tilt`` is the variance of the tilt at which a standing accelerometer with a bias seems
     level: no stance can take that out; an accelerometer that is off by as much of gravity makes every way
-    longer or shorter by that share.
+    longer or shorter by that share. ``s.creep`` is what the standing foot's velocity leaves open: it moves the
+    position on for as long as the foot walks.
     """
+    c = s.creep
+    creep_xy = 0.5 * (c.variance[0] + c.variance[1]) if s.tilt > 0.0 else 0.0
+    creep_z = c.variance[2] if s.tilt > 0.0 else 0.0
     for i in range(3):
         if s.started:
             position, attitude = s.P[pos + i, pos + i], s.P[att + i, att + i]
@@ -356,7 +423,9 @@ def emit_sigma(s: Any, pos: int, vel: int, att: int, out: FloatArray) -> None:
             if i < 2:
                 position += s.unknown_bias * s.lean[i] * s.lean[i]
                 attitude += s.unknown_tilt
+                position += creep_xy * (c.way[0] * c.way[0] + c.way[1] * c.way[1])
             else:
+                position += creep_z * c.time * c.time
                 attitude += s.unknown_bias * s.verdict.navigated_s * s.verdict.navigated_s
             out[SIGMA + i] = math.sqrt(max(0.0, position))
             out[SIGMA + 3 + i] = math.sqrt(max(0.0, s.P[vel + i, vel + i]))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..contract import AlgorithmError, Annotate, FloatArray, Input, Output, Remark, RowKernel
 from ..numerics.records import attributes, kernel_view
-from . import detectors
+from . import ceiling, detectors
 from .remarks import remarks
 from .sample import SAMPLE
 
@@ -26,6 +26,7 @@ PUBLISHED: dict[str, Any] = {
     "rest_acc": 0.8,
     "rest_gyr": 0.3,
     "rest_bias_sigma": 0.0,
+    "unclip": False,
 }
 """The source's detector and its rest of a fixed length."""
 ADAPTIVE: dict[str, Any] = {"detector": "gait", "init": "adaptive", "rest_acc": 0.5, "rest_gyr": 0.15}
@@ -119,6 +120,10 @@ class FootEstimator(RowKernel):
                 frame="imu",
             ),
         )
+        record.ceiling.on = p.unclip
+        record.ceiling.edge = max(2, round(ceiling.EDGE_S * self.rate_hz))
+        for axis in record.ceiling.axes:
+            axis["pending"][0] = -1
         self.configure(record, p)
         ring = 1 << (held + 2).bit_length()
         self.state = np.zeros(self.RECORD.itemsize + ring * SAMPLE.itemsize, np.uint8)

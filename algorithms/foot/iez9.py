@@ -20,6 +20,9 @@ N = 9
 ATT, POS, VEL = 0, 3, 6
 """First error states of attitude, position and velocity."""
 
+STANDING = 0.2
+"""Share of the specific force's variance while the foot stands."""
+
 FILTER: Fields = [
     ("q_gyr", "f8"),  # σ_ω², per unit of Δt²
     ("q_acc", "f8"),
@@ -134,7 +137,8 @@ def predict(s: Any, r: Any) -> None:
     dt, lasting = r.dt, max(r.dt, s.lasting)
     kalman.predict_motion(s.P, ATT, POS, VEL, s.force, dt)
     kalman.add_noise(s.P, ATT, turn_noise(s, r) * dt * lasting)
-    kalman.add_noise(s.P, VEL, s.q_acc * dt * lasting)
+    doubt_turn(s, r, ATT)
+    kalman.add_noise(s.P, VEL, force_noise(s) * dt * lasting)
     kalman.mirror(s.P)
 
 
@@ -142,6 +146,22 @@ def predict(s: Any, r: Any) -> None:
 def turn_noise(s: Any, r: Any) -> float:
     """Return the variance of the rate's error at the sample ``r``."""
     return s.q_gyr + s.q_scale * r.gyr_norm * r.gyr_norm
+
+
+@inlined
+def force_noise(s: Any) -> float:
+    """Return the variance of the specific force's error: of a foot that stands it is a bias, not a swing's."""
+    return s.q_acc * STANDING if s.lasting > 0.0 and s.stance_s > core.LONGEST_STANCE_S else s.q_acc
+
+
+@inlined
+def doubt_turn(s: Any, r: Any, att: int) -> None:
+    """Add to P, about the axis of the sensor, what a rate beyond its ceiling leaves open."""
+    for axis in range(3):
+        if r.doubt[axis] > 0.0:
+            for i in range(3):
+                for j in range(3):
+                    s.P[att + i, att + j] += s.rot[i, axis] * s.rot[j, axis] * r.doubt[axis] * r.dt
 
 
 @inlined

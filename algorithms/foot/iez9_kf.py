@@ -161,7 +161,7 @@ def _navigate(s: Any, ring: Any, out: FloatArray) -> None:
         # Its orientation filter knows neither the gyroscope's scale nor what a biased accelerometer hides of the tilt.
         for i in range(3):
             own = math.sqrt(max(0.0, s.orientation.P[i, i]))
-            out[core.SIGMA + 6 + i] = max(out[core.SIGMA + 6 + i], own)
+            out[core.SIGMA + 6 + i] = max(out[core.SIGMA + 6 + i], own) if s.tilt > 0.0 else own
     core.emit_detector(r, core.AFTER_SIGMA, out)
 
 

@@ -114,6 +114,14 @@ class FootParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             ge=0.0,
         ),
     ] = 0.0175
+    unclip: Annotated[
+        bool,
+        meta(
+            "Put back what a gyroscope at its ceiling cut off a turn, from the slopes on both sides, as far as the "
+            "detector's look-ahead reaches",
+            source="ours: cubic Hermite interpolation",
+        ),
+    ] = True
     gravity: Annotated[float, meta("Local gravity", "m/s²", "dissertation", gt=0.0, le=30.0)] = 9.81
     gravity_from_rest: Annotated[
         bool,

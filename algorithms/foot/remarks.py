@@ -261,6 +261,24 @@ def verdict(s: Any, p: Any) -> list[Remark]:
                         "this walk, turns and speeds in the swing are underestimated",
                     )
                 )
+    return result + _put_back(s)
+
+
+def _put_back(s: Any) -> list[Remark]:
+    """Return which axes stop at a ceiling again and again, and what was put back of their turns."""
+    result: list[Remark] = []
+    for i, column in enumerate(IMU_COLUMNS[3:]):
+        for side, sign in enumerate((1.0, -1.0)):
+            count, angle, level = (s.ceiling.axes[i][name][side] for name in ("count", "angle", "level"))
+            if count >= CLIPPED_SAMPLES:
+                result.append(
+                    Remark(
+                        "clipped",
+                        f"{column} flattens near {sign * level:.3g} rad/s in {count} turns: the sensor's range is too "
+                        f"small for this walk; {angle:.2f} rad were put back from the slopes on both sides, right to "
+                        "about 45 %",
+                    )
+                )
     return result
 
 

@@ -174,7 +174,8 @@ def backward(
         for block in range(3):
             first = POS if block == 0 else VEL if block == 1 else ATT
             for i in range(first, first + 3):
-                variance = log.P[i, i]
+                forward_sigma = out[k, core.SIGMA + 3 * block + i - first]  # what is considered is in it
+                variance = forward_sigma * forward_sigma
                 for m in range(N):
                     variance -= left[i, m] * log.P[m, i]
                 out[k, core.SIGMA + 3 * block + i - first] = math.sqrt(max(0.0, variance))

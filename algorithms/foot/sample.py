@@ -11,6 +11,7 @@ SAMPLE = record_type(
     ("extra", "f8", (4,)),  # columns of the further inputs, NaN where none arrived
     ("acc_norm", "f8"),
     ("gyr_norm", "f8"),
+    ("doubt", "f8", (3,)),  # rad²/s a second, variance of a rate that was put back beyond a ceiling
     ("pitch", "f8"),  # deg, where the detector follows it
     ("statistic", "f8", (3,)),  # of the detector, as many as it has
     ("queue", "i8"),  # place in the queue of an adaptive detector

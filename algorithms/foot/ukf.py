@@ -146,7 +146,8 @@ def predict(s: Any, r: Any) -> None:
         s.vel[i] -= s.centre[VEL + i]
         s.pos[i] -= s.centre[POS + i]
     kalman.add_noise(s.P, ATT, base.turn_noise(s, r) * dt * lasting)
-    kalman.add_noise(s.P, VEL, s.q_acc * dt * lasting)
+    base.doubt_turn(s, r, ATT)
+    kalman.add_noise(s.P, VEL, base.force_noise(s) * dt * lasting)
     kalman.mirror(s.P)
 
 

@@ -11,7 +11,7 @@ Frames
 Phases of a stride
     heel-off (the foot rolls about the ball), swing (the ball leaves the ground, the heel arrives), slap
     (the foot rolls down about the heel), flat (the foot stands; velocity exactly zero unless
-    ``stance_roll_deg`` is set).
+    ``stance_roll_deg`` or ``arch_mm`` is set).
 """
 
 from __future__ import annotations
@@ -61,6 +61,10 @@ class Style(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         is exactly zero.
     stance_share : float
         Share of the stride that the foot stands.
+    arch_mm : float
+        The instep, and the box on it, sinks by so much from heel strike to the end of the stance, as the arch gives
+        under the body's weight, and rises with the heel (mm). The navicular drop of a walking adult is 5.3 mm
+        (median of 280 feet, 1.7 to 13.4; Nielsen et al. 2009). The truth calls these samples ``still``. Default 0.
     strike_mm, strike_hz, strike_s : float
         Heel-strike transient: a burst of vertical vibration of this amplitude, frequency and length.
         Default amplitude 0.
@@ -73,6 +77,7 @@ class Style(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
     clearance_m: _NonNegative = 0.07
     stance_roll_deg: _NonNegative = 0.0
     stance_share: Annotated[float, msgspec.Meta(gt=0.02, lt=0.9)] = STANCE_SHARE
+    arch_mm: _NonNegative = 0.0
     strike_mm: _NonNegative = 0.0
     strike_hz: _Positive = 40.0
     strike_s: _Positive = 0.04
@@ -269,6 +274,11 @@ class GaitModel:
         pivot[0] += begin
         # Not by the sum above but to the bit: a standing foot stands on its footfall.
         pivot[0][standing] = (there[:, :3] + _turn(there[:, 3], ball))[standing]
+        if style.arch_mm:
+            give = 1e-3 * style.arch_mm
+            sunk = np.where(i > 0, give, 0.0)
+            sinks = np.where(i < len(self.durations) - 1, give, 0.0)
+            pivot[:, :, 2] += _combine(-sunk, [(sunk, step(0.0, air + 0.3 * swing)), (-sinks, step(strike, 1.0))])
         riding = np.zeros(n, bool)
         for start, climb in self._rides:
             part = (t - start) / self._ride_s

@@ -161,7 +161,7 @@ GAITS: dict[str, dict[str, float]] = {
     "run": {"stride_m": 2.3, "stride_s": 0.75, "stance_share": 0.14},
 }
 """Strides of the gaits; a run's foot stands for a tenth of a second."""
-UNKIND_STYLE = {"stance_roll_deg": 1.0, "strike_mm": 0.5}
+UNKIND_STYLE = {"strike_mm": 0.5, "arch_mm": 5.3}
 """A foot that rolls as it stands, and strikes: about the ball, real ones (Vicon) about a point farther back."""
 
 
