@@ -365,10 +365,17 @@ def judge_innovation(s: Any, r: Any, vel: int, variance: float) -> None:
     _note_creep(s, r)
     if s.stance_s > r.dt:
         return
-    square = 0.0
-    for i in range(3):
-        error = s.vel[i] - s.stance_vel[i]
-        square += error * error / (s.P[vel + i, vel + i] + variance)
+    # eᵀ (P + R)⁻¹ e by Cholesky's columns: the whole of P, so that no heading of the sensor counts for another
+    P = s.P
+    e0, e1, e2 = s.vel[0] - s.stance_vel[0], s.vel[1] - s.stance_vel[1], s.vel[2] - s.stance_vel[2]
+    d0 = P[vel, vel] + variance
+    l10, l20 = P[vel + 1, vel] / d0, P[vel + 2, vel] / d0
+    d1 = P[vel + 1, vel + 1] + variance - l10 * l10 * d0
+    l21 = (P[vel + 2, vel + 1] - l20 * l10 * d0) / d1
+    d2 = P[vel + 2, vel + 2] + variance - l20 * l20 * d0 - l21 * l21 * d1
+    y1 = e1 - l10 * e0
+    y2 = e2 - l20 * e0 - l21 * y1
+    square = e0 * e0 / d0 + y1 * y1 / d1 + y2 * y2 / d2
     s.verdict.n_judged += 1
     if square > SURPRISE:
         s.verdict.n_surprising += 1

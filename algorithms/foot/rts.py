@@ -25,6 +25,8 @@ SEGMENT = 4096
 
 NOT_STARTED, START, NAVIGATED = 0, 1, 2
 MOST_UPDATES = 6
+ROUNDING = 1e-9
+"""Share of a variance by which its root's square differs: more is what the filter considers, beside P."""
 
 LOG = record_type(
     ("stage", "i8"),
@@ -174,8 +176,10 @@ def backward(
         for block in range(3):
             first = POS if block == 0 else VEL if block == 1 else ATT
             for i in range(first, first + 3):
-                forward_sigma = out[k, core.SIGMA + 3 * block + i - first]  # what is considered is in it
-                variance = forward_sigma * forward_sigma
+                variance = log.P[i, i]
+                considered = out[k, core.SIGMA + 3 * block + i - first] ** 2 - variance
+                if considered > ROUNDING * variance:
+                    variance += considered
                 for m in range(N):
                     variance -= left[i, m] * log.P[m, i]
                 out[k, core.SIGMA + 3 * block + i - first] = math.sqrt(max(0.0, variance))

@@ -278,7 +278,9 @@ class GaitModel:
             give = 1e-3 * style.arch_mm
             sunk = np.where(i > 0, give, 0.0)
             sinks = np.where(i < len(self.durations) - 1, give, 0.0)
-            pivot[:, :, 2] += _combine(-sunk, [(sunk, step(0.0, air + 0.3 * swing)), (-sinks, step(strike, 1.0))])
+            pivot[:, :, 2] += _combine(
+                -sunk, [(sunk, step(0.0, air + 0.3 * swing)), (-sinks, step(strike, 1.0))]
+            )
         riding = np.zeros(n, bool)
         for start, climb in self._rides:
             part = (t - start) / self._ride_s

@@ -88,7 +88,7 @@ class Options(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         How the foot moves.
     errors : str
         ``mpu6050``: the errors of the real device where none are given; ``unkind``: with what wear, strap and missing
-        calibration add, and a foot that rolls as it stands; ``none``: no error at all.
+        calibration add, and a foot whose arch gives; ``none``: no error at all.
     gait : str
         ``walk``, ``fast`` or ``run``: stride, its time and the share of it that the foot stands, where they are not
         given.
@@ -162,7 +162,7 @@ GAITS: dict[str, dict[str, float]] = {
 }
 """Strides of the gaits; a run's foot stands for a tenth of a second."""
 UNKIND_STYLE = {"strike_mm": 0.5, "arch_mm": 5.3}
-"""A foot that rolls as it stands, and strikes: about the ball, real ones (Vicon) about a point farther back."""
+"""A foot that strikes, and whose arch gives. It does not roll about its ball: real ones do so farther back."""
 
 
 def make_options(scenario: str, overrides: dict[str, Any]) -> Options:
