@@ -135,11 +135,13 @@ def ranges(rec: Recording, fig: Figure) -> None:
         if truth is not None:
             ax.plot(*truth.at(np.array([t_ns]))[0][:2], "o", color=style.REFERENCE, label="true position")
         _title(ax, f"{title}, window to {(t_ns - (rec.start_ns or 0)) / 1e9:.0f} s")
-        ax.legend(fontsize=7, loc="upper right")
+        ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3)
 
 
 def powers(rec: Recording, fig: Figure) -> None:
     """Received power over distance: means with the fitted models and other exponents, histograms by distance."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
     from ..replay import calibrate
 
     models = calibrate("radio", [rec], {"method": "regression"})[0].values["anchors"]
@@ -181,6 +183,9 @@ def powers(rec: Recording, fig: Figure) -> None:
             line = one["p_d0"] - 10 * eta * np.log10(d)
             left.plot(d, line, color="#888888", linewidth=0.8, linestyle=":", label=f"η {eta:g}")
         left.set_xscale("log")
+        left.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        left.xaxis.set_major_formatter(FuncFormatter(lambda metres, _: f"{metres:g}"))
+        left.xaxis.set_minor_formatter(NullFormatter())
         left.set_xlabel("distance (m)", fontsize=9)
         left.set_ylabel("dBm", fontsize=9)
         left.legend(fontsize=7)

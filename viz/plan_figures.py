@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +21,16 @@ from .trace import Trace
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.transforms import Bbox
 
 Floats = NDArray[np.float64]
 MOMENTS = 6
 """Panels of clouds of particles over the time of a run."""
-MOST_LINES = 66
-"""Distances between so many pairs of anchors are drawn; of more only the nearest."""
+MOST_LINES = 30
+"""Distances between so many pairs of anchors are drawn; of more those of each to its nearest ones."""
+NEAREST = 3
+AROUND = ((6, 6), (6, -6), (-6, 6), (-6, -6), (0, 10), (0, -10), (14, 14), (-14, -14), (14, -14), (-14, 14))
+"""Where a label may stand beside its anchor (points)."""
 STAYS_S, SAME_M = 4.0, 0.3
 """A true position that stays within so much for so long is a point at which somebody stood."""
 
@@ -83,20 +88,85 @@ def anchors(rec: Recording, fig: Figure) -> None:
         (float(np.linalg.norm(a.position[:2] - b.position[:2])), a, b)
         for a, b in itertools.combinations(plan.anchors.values(), 2)
     ]
-    for far, a, b in sorted(pairs, key=lambda p: p[0])[:MOST_LINES]:
+    pairs.sort(key=lambda p: p[0])
+    few = len(pairs) <= MOST_LINES
+    if not few:  # of each anchor those to its nearest
+        near = {a.mac: [p for p in pairs if a in p[1:]][:NEAREST] for a in plan.anchors.values()}
+        pairs = [p for p in pairs if any(p in mine for mine in near.values())]
+    draw_floor(ax, plan)
+    ax.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    between = [
+        (f"{far:.1f}", a.position[:2] + share * (b.position[:2] - a.position[:2]))
+        for (far, a, b), share in zip(pairs, itertools.cycle((0.5, 0.4, 0.6)))
+    ]
+    for _, a, b in pairs:
         ends = np.array([a.position[:2], b.position[:2]])
         ax.plot(ends[:, 0], ends[:, 1], color="#9ab", linewidth=0.7, zorder=0)
-        if len(pairs) <= MOST_LINES / 2:
-            x, y = ends.mean(axis=0).tolist()
-            ax.text(x, y, f"{far:.1f}", fontsize=7, color="#456", ha="center", va="center")
-    draw_floor(ax, plan)
+    words = []
     for one in plan.anchors.values():
         model = f"\n{one.p_d0:.1f} dBm, η {one.eta:.2f}" if np.isfinite(one.p_d0 + one.eta) else ""
-        text = f"{printable(one.mac)}{model}"
-        x, y = one.position[:2].tolist()
-        ax.annotate(text, (x, y), xytext=(5, 5), textcoords="offset points", fontsize=7)
-    ax.set_title("anchors, and the distances between them (m)", fontsize=10, loc="left")
-    ax.legend(fontsize=8)
+        words.append((f"{printable(one.mac)}{model}", one.position[:2]))
+    taken = place_labels(ax, words)
+    place_labels(ax, between, color="#456", offsets=((0, 0), *AROUND), taken=taken)
+    which = "the distances between them" if few else f"the distances of each to its nearest {NEAREST}"
+    ax.set_title(f"anchors, and {which} (m)", fontsize=10, loc="left")
+
+
+def place_labels(
+    ax: Axes,
+    labels: Sequence[tuple[str, Floats]],
+    *,
+    color: str = "black",
+    offsets: Sequence[tuple[int, int]] = AROUND,
+    taken: Sequence[Bbox] = (),
+) -> list[Bbox]:
+    """Write labels beside places so that they cover each other as little as can be; return the boxes that are taken.
+
+    Parameters
+    ----------
+    ax : Axes
+        With its limits set by what is drawn already.
+    labels : sequence of (str, ndarray)
+        Text, and the place (2,) that it belongs to.
+    color : str
+        Of the text.
+    offsets : sequence of (int, int)
+        Points (1/72 inch) from the place to the label's near side, in order of preference.
+    taken : sequence of Bbox
+        Boxes (pixels) that are there.
+    """
+    from matplotlib.transforms import Bbox
+
+    boxes = list(taken)
+    ax.figure.draw_without_rendering()
+    markers = [Bbox.from_extents(*(p - 5), *(p + 5)) for p in (ax.transData.transform(w) for _, w in labels)]
+    for text, where in labels:
+        best: tuple[float, Any, Bbox | None] = (np.inf, None, None)
+        for right, up in offsets:
+            note = ax.annotate(
+                text,
+                (float(where[0]), float(where[1])),
+                xytext=(right, up),
+                textcoords="offset points",
+                fontsize=7,
+                color=color,
+                ha="left" if right > 0 else "right" if right < 0 else "center",
+                va="bottom" if up > 0 else "top" if up < 0 else "center",
+            )
+            box = note.get_window_extent()
+            crossed = [Bbox.intersection(box, other) for other in (*boxes, *markers)]
+            covered = sum(c.width * c.height for c in crossed if c is not None)
+            if covered < best[0]:
+                if best[1] is not None:
+                    best[1].remove()
+                best = covered, note, box
+            else:
+                note.remove()
+            if covered == 0:
+                break
+        if best[2] is not None:
+            boxes.append(best[2])
+    return boxes
 
 
 def triples(rec: Recording, fig: Figure) -> None:
@@ -123,6 +193,7 @@ def triples(rec: Recording, fig: Figure) -> None:
             ax.plot(*truth.at(np.array([t]))[0][:2], "o", color=style.REFERENCE, label="true position")
         low, high = _frame(plan, 3.0)
         outside = int((((points < low) | (points > high)).any(axis=1)).sum())
+        ax.set_aspect("equal", adjustable="box")
         ax.set_xlim(low[0], high[0])
         ax.set_ylim(low[1], high[1])
         beyond = f", {outside} triples beyond the picture" if outside else ""
@@ -152,9 +223,11 @@ def points(rec: Recording, fig: Figure) -> None:
         raise _nothing(rec, "nobody stood at a point, or no run has positions")
     fig.set_size_inches(13.0, 4.6 * len(runs))
     axes = np.ravel(fig.subplots(len(runs), 1, squeeze=False))
+    low, high = _frame(plan, 3.0)
     for ax, run in zip(axes, runs, strict=True):
         draw_floor(ax, plan, names=False)
         table = rec.table(f"{run}/position")
+        outside = 0
         t, where = table["t_ns"].to_numpy(), table.select("pos_x", "pos_y").to_numpy()
         for k, (first, last, place) in enumerate(stays):
             mine = where[(t > first) & (t <= last)]
@@ -164,8 +237,14 @@ def points(rec: Recording, fig: Figure) -> None:
                 error = np.linalg.norm(mine - place, axis=1)
                 name = f"({place[0]:.1f}, {place[1]:.1f}): {len(mine)} fixes, mean error {error.mean():.2f} m"
                 ax.plot(mine[:, 0], mine[:, 1], ".", color=color, label=name)
-        ax.set_title(f"{_correction(rec, run)}{printable(run[10:])}", fontsize=10, loc="left")
-        ax.legend(fontsize=7, loc="upper right")
+                outside += int(((mine < low) | (mine > high)).any(axis=1).sum())
+        if plan:  # one bad fix must not make the floor small
+            ax.set_aspect("equal", adjustable="box")
+            ax.set_xlim(low[0], high[0])
+            ax.set_ylim(low[1], high[1])
+        beyond = f", {outside} fixes beyond the picture" if plan and outside else ""
+        ax.set_title(f"{_correction(rec, run)}{printable(run[10:])}{beyond}", fontsize=10, loc="left")
+        ax.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.01, 1.0))
 
 
 def _correction(rec: Recording, run: str) -> str:

@@ -84,7 +84,7 @@ ANY_ZERO_M2 = 1e4
 """Variance of the barometer's zero before it was heard."""
 SURE = 0.75
 """Probability that another floor needs before a change is stated."""
-TURN_S = 2.0, 20.0
+TURN_S = 2.0, 40.0
 """Shortest and longest turn of a carrier that turns steadily (s)."""
 
 SHOWN, SHOWN_NS = 60, 1_000_000_000

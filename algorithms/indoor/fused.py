@@ -114,7 +114,7 @@ class IndoorFusedParams(msgspec.Struct, frozen=True, kw_only=True):
             ge=0,
             le=1,
         ),
-    ] = 0.3
+    ] = 0.5
     pattern_s: Annotated[
         float, meta("time over which one that turns as it likes looks the same way", "s", "", gt=0)
     ] = 3.0
