@@ -22,11 +22,12 @@ from .radio import anchor_table, local_address, technology_of
 from .text import start_of
 from .units import conversion
 
+PLACE_WORD = r"(pos(ition)?|posi[cç][aã]o|coord(inate)?|coordenada)"
 ANCHOR_ROLES = {
     "mac": r"mac|((mac|hardware) )?address|bssid",
-    "x": r"(pos(ition)? ?)?x( (m|cm|mm|ft))?",
-    "y": r"(pos(ition)? ?)?y( (m|cm|mm|ft))?",
-    "z": r"(pos(ition)? ?)?z( (m|cm|mm|ft))?|(height|h|altura)( (m|cm|mm|ft))?",
+    "x": rf"({PLACE_WORD} ?)?x( (m|cm|mm|ft))?",
+    "y": rf"({PLACE_WORD} ?)?y( (m|cm|mm|ft))?",
+    "z": rf"({PLACE_WORD} ?)?z( (m|cm|mm|ft))?|(height|h|altura)( (m|cm|mm|ft))?",
     "lat": r"lat(itude)?( deg)?",
     "lon": r"(lon|lng|long)(itude)?( deg)?",
     "p_d0": r"p d0|p0|rssi d0|(mean )?(rssi|power)( (at )?(1 ?m|d0))?|(measured|tx|calibrated) ?power|a",
@@ -87,6 +88,15 @@ def is_anchor_header(header: TableHeader) -> bool:
     there = set(_roles(header))
     placed = {"x", "y"} <= there or {"lat", "lon"} <= there
     return "mac" in there and placed and not header.roles(NOT_ANCHORS)
+
+
+def doubt_of_header(head: bytes) -> str:
+    """Return what is missing of a table that names addresses of beacons and no times: it may be one of anchors."""
+    header = header_of(head)
+    if header is None or header.roles(NOT_ANCHORS) or "mac" not in _roles(header):
+        return ""
+    names = ", ".join(header.names[:8])
+    return f"a table of addresses without x and y, or lat and lon ({names}): name them so to have a table of anchors"
 
 
 def _roles(header: TableHeader) -> dict[str, int]:

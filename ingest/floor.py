@@ -25,6 +25,8 @@ PLACE_KEYS = ("width_m", "height_m", "metres_per_pixel", "x_m", "y_m", "x_axis_a
 KINDS = ("wall", "obstacle", "passable", "room", "zone", "stairs")
 EAST_DEG = 90.0
 """Azimuth of the x axis of what was laid out from degrees."""
+OTHER_PICTURES = (".bmp", ".gif", ".tif", ".tiff", ".webp", ".pdf", ".svg")
+"""Pictures of a floor that no viewer here draws: they are refused as such."""
 PICTURES = {b"\x89PNG\r\n\x1a\n": ("plan.png", "image/png"), b"\xff\xd8\xff": ("plan.jpg", "image/jpeg")}
 
 
@@ -52,7 +54,7 @@ def kind_of(path: Path) -> str:
     if not path.is_file():
         return ""
     head = start_of(path, 65536)
-    if any(head.startswith(magic) for magic in PICTURES):
+    if any(head.startswith(magic) for magic in PICTURES) or path.suffix.lower() in OTHER_PICTURES:
         return "picture"
     if head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
         if b'"FeatureCollection"' in head:
@@ -103,12 +105,14 @@ def read_floor(paths: Sequence[Path], settings: Mapping[str, Any], report: Repor
         floor.attachments.append(SourceAttachment("plan.geojson", data, "application/geo+json"))
     if "picture" in by_kind:
         path = by_kind["picture"]
+        head = start_of(path, 16)
+        if not any(head.startswith(magic) for magic in PICTURES):
+            raise UsageError(f"{path}: a picture of a floor is PNG or JPEG; save it as one of them")
         if not {"width_m", "height_m", "metres_per_pixel"} & set(place):
             raise UsageError(
                 f"{path}: nothing says how large it is; set plan.width_m=… (m from its left to its right edge), "
                 f"or write {path.stem}.json with width_m, x_m, y_m, x_axis_azimuth_deg"
             )
-        head = start_of(path, 16)
         name, media = next(v for magic, v in PICTURES.items() if head.startswith(magic))
         place = _filled(place, path)
         floor.attachments.append(SourceAttachment(name, path.read_bytes(), media))

@@ -337,7 +337,9 @@ def _known_otherwise(head: bytes) -> str:
     for magic, reason in _OTHERS.items():
         if head.startswith(magic):
             return reason
-    return ""
+    from .anchors import doubt_of_header
+
+    return doubt_of_header(head)
 
 
 def _is_data(path: Path, folder: Path) -> bool:

@@ -116,3 +116,29 @@ def test_an_unknown_unit_of_length_is_refused(log: list[Path], tmp_path: Path) -
     (tmp_path / "b.csv").write_text("mac,x (px),y (px)\na,1,2\nb,3,4\n")
     with pytest.raises(MarchaError, match=r"b\.csv, line 1: column 'x \(px\)'.*cannot become m"):
         convert([*log, tmp_path / "b.csv"], tmp_path / "a.mcap")
+
+
+def test_a_table_in_portuguese_with_floors(log: list[Path], tmp_path: Path) -> None:
+    rows = ["Beacon ID;Posição X (ft);Posição Y (ft);Altura (ft);Andar"]
+    rows += [
+        f"{m};{x / 0.3048:.4f};{y / 0.3048:.4f};{z / 0.3048:.4f};1" for m, (_, x, y, z, *_) in ANCHORS.items()
+    ]
+    (tmp_path / "b.csv").write_text("\n".join(rows).replace(".", ","))
+    convert([*log, tmp_path / "b.csv"], tmp_path / "a.mcap")
+    found = anchors_in(tmp_path / "a.mcap").select("x", "y", "z", "floor").to_numpy()
+    np.testing.assert_allclose(found, [(x, y, z, 1) for _, x, y, z, *_ in ANCHORS.values()], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "what"),
+    [
+        ("floor.bmp", b"BM6\0\0\0", "PNG or JPEG"),
+        ("b.csv", b"beacon;east of door;north of door\n02:00:00:00:00:01;1;2\n", "without x and y"),
+    ],
+)
+def test_what_is_no_floor_says_what_it_lacks(
+    log: list[Path], tmp_path: Path, name: str, content: bytes, what: str
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(MarchaError, match=what):
+        convert([*log, tmp_path / name], tmp_path / "a.mcap", options={"plan.width_m": 25})

@@ -289,4 +289,4 @@ def test_ten_points_are_located_once_the_exchange_of_two_anchors_is_undone(data_
         points, _ = converted(tmp_path, folder / "Tests_Scenario1.xlsx", **options, exchange="B C")
         result = replay(points, ["indoor.fingerprint", "indoor.fingerprint[preset=knn]"], calibrations=survey)
         assert {r.alignment for r in result.runs} == {"none"}
-        assert min(r.metrics["position_error_mean_m"] for r in result.runs) < 1.3
+        assert min(r.metrics["position_error_mean_m"] for r in result.runs) < 1.4

@@ -138,7 +138,7 @@ def place_labels(
     from matplotlib.transforms import Bbox
 
     boxes = list(taken)
-    ax.figure.draw_without_rendering()
+    ax.get_figure(root=True).draw_without_rendering()  # type: ignore[union-attr]
     markers = [Bbox.from_extents(*(p - 5), *(p + 5)) for p in (ax.transData.transform(w) for _, w in labels)]
     for text, where in labels:
         best: tuple[float, Any, Bbox | None] = (np.inf, None, None)

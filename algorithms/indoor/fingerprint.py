@@ -11,7 +11,7 @@ import numpy as np
 
 from ..contract import AlgorithmError, Context, FloatArray, Message, PlainEstimator, Remark, Result
 from ..parameters import meta
-from .anchors import device_of
+from .anchors import ATTACHMENT, device_of, parse_anchors
 from .places import places_of
 from .radio_map import field_of
 from .trilateration import POSITION, RADIO, SIGMA
@@ -79,7 +79,9 @@ class IndoorFingerprint(PlainEstimator):
             for mac, power in place.powers.items():
                 table[i, self.number[mac]] = power
         self.table = table
-        self.field = field_of(self.where[:, :2], table) if self.params.method == "map" else None
+        self.field = None
+        if self.params.method == "map":
+            self.field = field_of(self.where[:, :2], table, self._anchors(context))
         if len(places) < 3:
             raise AlgorithmError(
                 f"a radio map of {len(places)} places gives no positions; survey at least three"
@@ -90,6 +92,15 @@ class IndoorFingerprint(PlainEstimator):
         self.powers: dict[int, list[float]] = {}
         self.counts = {"fixes": 0, "few": 0}
         self.unknown: set[str] = set()
+
+    def _anchors(self, context: Context) -> FloatArray:
+        """Return x, y of the transmitters (n, 2), NaN where no anchor table has them."""
+        places = np.full((len(self.number), 2), np.nan)
+        if ATTACHMENT in context.attachments:
+            for row in parse_anchors(context.attachments[ATTACHMENT]):
+                if row["mac"] in self.number:
+                    places[self.number[row["mac"]]] = row["x"], row["y"]
+        return places
 
     def take(self, message: Message) -> Iterable[Result]:
         """Take one power; a window that it is beyond is answered first."""

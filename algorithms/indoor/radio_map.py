@@ -172,10 +172,11 @@ class RadioField:
     covered: NDArray[np.bool_]
 
 
-def field_of(where: FloatArray, powers: FloatArray) -> RadioField:
+def field_of(where: FloatArray, powers: FloatArray, anchors: FloatArray | None = None) -> RadioField:
     """Return a Gaussian process for each transmitter (Ferris et al. 2006), about a level that falls with distance.
 
-    Mean: least squares of a constant and log distance to the place where it is strongest (its anchor is not known).
+    Mean: least squares of a constant and log distance to its anchor, or to the place where it is strongest where the
+    anchor is not known.
     What is left has the variance of its residuals, half of it room-sized (:data:`LENGTH_M`), half within a
     wavelength. The grid reaches half the distance between neighbouring places beyond them (at least half a metre, at
     most :data:`MARGIN_M`), no farther: there nothing was surveyed.
@@ -186,6 +187,8 @@ def field_of(where: FloatArray, powers: FloatArray) -> RadioField:
         Places (m), shape (m, 2).
     powers : ndarray
         dBm, NaN where not heard, shape (m, transmitters).
+    anchors : ndarray, optional
+        x, y (m) of each transmitter, NaN where not known, shape (transmitters, 2).
     """
     from scipy.spatial import KDTree
 
@@ -206,10 +209,10 @@ def field_of(where: FloatArray, powers: FloatArray) -> RadioField:
     for k in np.flatnonzero(covered).tolist():
         here = np.isfinite(powers[:, k])
         p = powers[here, k]
-        top = where[here][np.argsort(-p)[: max(1, here.sum() // 10)]].mean(axis=0)
-        design = np.column_stack(
-            [np.ones(here.sum()), -10 * np.log10(1 + np.linalg.norm(where[here] - top, axis=1))]
-        )
+        top, blur = where[here][np.argsort(-p)[: max(1, here.sum() // 10)]].mean(axis=0), 1.0
+        if anchors is not None and np.isfinite(anchors[k]).all():
+            top, blur = anchors[k], 0.3
+        design = np.column_stack([np.ones(here.sum()), _fall(where[here], top, blur)])
         (level, eta), *_ = np.linalg.lstsq(design, p, rcond=None)
         eta = min(max(eta, 0.0), 6.0)
         level = float(np.mean(p - eta * design[:, 1]))
@@ -219,7 +222,12 @@ def field_of(where: FloatArray, powers: FloatArray) -> RadioField:
             0.5 * np.exp(-between[np.ix_(here, here)] / LENGTH_M) + 0.5 * np.eye(here.sum())
         )
         weights = np.linalg.solve(covariance, 0.5 * variance * cross[:, here].T).T
-        mean[k] = level - eta * 10 * np.log10(1 + np.linalg.norm(grid - top, axis=1)) + weights @ left
+        mean[k] = level + eta * _fall(grid, top, blur) + weights @ left
         spread = 0.5 * variance - np.einsum("ij,ij->i", weights, 0.5 * variance * cross[:, here])
         sd[k] = np.sqrt(np.maximum(spread, 0.0) + 0.25 * variance)
     return RadioField(grid, mean, sd, covered)
+
+
+def _fall(where: FloatArray, top: FloatArray, blur_m: float) -> FloatArray:
+    """Return −10 log10 of the distances (m) of places (n, 2) to ``top`` (2,), which is known to ``blur_m``."""
+    return -10.0 * np.log10(blur_m + np.linalg.norm(where - top, axis=1))
