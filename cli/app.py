@@ -5,6 +5,7 @@ Nothing heavy is imported here or at the top of a command's module: ``marcha --h
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
@@ -150,6 +151,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv : sequence of str, optional
         Arguments without the program's name; those of the process by default.
     """
+    for stream in (sys.stdout, sys.stderr):  # a terminal of another encoding: what it lacks becomes escapes
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     with _ending_well():
         return _run(argv)
 

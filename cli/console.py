@@ -97,8 +97,14 @@ def emit_json(document: dict[str, Any]) -> None:
         text = msgspec.json.encode(document, enc_hook=plain)
     except UnicodeEncodeError:  # a file's name that is no UTF-8
         text = msgspec.json.encode(_encodable(document), enc_hook=plain)
-    # JSON leaves what turns the direction of writing, and C1, as they are: a terminal does not.
-    sys.stdout.write("".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text.decode()) + "\n")
+    # JSON leaves what turns the direction of writing, and C1, as they are: a terminal does not. Another encoding
+    # than UTF-8 gets ASCII.
+    plain_text = str.isprintable if _is_utf8(sys.stdout) else str.isascii
+    sys.stdout.write("".join(c if plain_text(c) else json.dumps(c)[1:-1] for c in text.decode()) + "\n")
+
+
+def _is_utf8(stream: Any) -> bool:
+    return (getattr(stream, "encoding", None) or "utf-8").lower().replace("-", "") == "utf8"
 
 
 def _encodable(value: Any) -> Any:

@@ -19,7 +19,7 @@ def expected(error: BaseException) -> tuple[str, int] | None:
     """Return the one line and the exit code of an expected failure, None where it is a bug.
 
     Expected are :class:`MarchaError` (its own exit code), :class:`AlgorithmError` (the call is wrong: 2), an
-    ``OSError`` that names a path or says that the disk is full, and the keyboard.
+    ``OSError`` that names a path or says that the disk is full, a text that is no Unicode, and the keyboard.
     """
     if isinstance(error, Terminated):
         return "ended by a signal; nothing was left half written", error.exit_code
@@ -27,6 +27,8 @@ def expected(error: BaseException) -> tuple[str, int] | None:
         return "interrupted; nothing was left half written", INTERRUPTED
     if isinstance(error, OSError):
         return _operating_system(error)
+    if isinstance(error, UnicodeEncodeError):  # an argument in another encoding than the terminal's
+        return f"{error.object[:60]!r}: holds bytes that are no UTF-8; write it in UTF-8", USAGE
     if isinstance(error, MemoryError):
         return "out of memory; nothing was left half written", FAILED
     from ..algorithms.contract import AlgorithmError

@@ -51,7 +51,8 @@ def check_times(values: NDArray[Any], where: str) -> NDArray[np.int64]:
     if len(values) and values.astype(np.int64, copy=False).view(np.uint64).max() > MAX_TIME_NS:
         bad = int(np.argmax((values < 0) | (values > MAX_TIME_NS)))
         raise MarchaError(
-            f"{where}: row {bad}: time {values[bad]} ns; it must lie between 0 and {MAX_TIME_NS}"
+            f"{where}: row {bad}: time {values[bad] / SECOND:.10g} s; a recording holds 0 to {MAX_TIME_NS // SECOND} s "
+            "(1970 to 2038): add a constant to the times of the log"
         )
     return values.astype(np.int64, copy=False)
 

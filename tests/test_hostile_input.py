@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import io
+import json
 import os
+import re
+import sys
 import zipfile
 from pathlib import Path
 
 import polars as pl
 import pytest
+from marcha.cli import main
 from marcha.ingest.contract import ReportBuilder
 from marcha.ingest.timestamps import TimestampRepair
 from marcha.recording import MarchaError
@@ -78,6 +83,24 @@ def test_counters_at_the_end_of_64_bits_do_not_wrap(tmp_path: Path) -> None:
     done = mapped(tmp_path, MAP, "t,x,y,z\n" + "".join(rows))
     assert done.code == 1
     assert "has a time and a value" in done.complaint
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [
+        (-150_000_000, "1970 to 2038"),
+        (2_200_000_000, "1970 to 2038"),
+        (7_000_000_000, "beyond any clock (ns)"),
+    ],
+)
+def test_times_that_no_recording_holds_are_one_line_with_a_remedy(
+    tmp_path: Path, seconds: int, said: str
+) -> None:
+    rows = "".join(f"{seconds * 10**9 + k * 10**7},0.{k % 7},1,9.8\n" for k in range(300))
+    done = mapped(tmp_path, MAP, "t,x,y,z\n" + rows)
+    assert done.code == 1
+    assert said in done.complaint
+    assert re.search("add a constant to the times|does the mapping fit", done.complaint)
 
 
 def test_a_header_whose_time_has_no_unit_is_one_line(tmp_path: Path) -> None:
@@ -288,6 +311,32 @@ def test_control_characters_of_a_file_do_not_reach_the_terminal(tmp_path: Path) 
     assert "\\x1b" in done.out
     assert "\x1b" not in done.out + done.err
     assert "\x07" not in done.out + done.err
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_a_terminal_of_another_encoding_gets_escapes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoding: str
+) -> None:
+    (tmp_path / "Füße→.csv").write_text(GOOD)
+    said = {}
+    for more in ((), ("--json",)):
+        monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding=encoding))
+        assert main(
+            ["convert", str(tmp_path / "Füße→.csv"), "-o", str(tmp_path / "→.mcap"), "--force", *more]
+        ) in (0, 3)
+        sys.stdout.flush()
+        said[more] = sys.stdout.buffer.getvalue().decode(encoding)  # type: ignore[attr-defined]
+    assert "\\u2192.mcap" in said[()]
+    assert json.loads(said[("--json",)])["output"] == str(tmp_path / "→.mcap")
+
+
+def test_an_argument_in_another_encoding_is_one_line(tmp_path: Path) -> None:
+    convert(tmp_path, GOOD)
+    label = ("--label", os.fsdecode(b"\xe9"), "--from", "0.1")
+    done = marcha("annotate", "add", tmp_path / "out.mcap", *label, "-o", tmp_path / "b.mcap")
+    assert done.code == 2
+    assert "no UTF-8" in done.complaint
+    assert not (tmp_path / "b.mcap").exists()
 
 
 def test_a_finding_is_whole_in_a_pipe(tmp_path: Path) -> None:

@@ -138,6 +138,16 @@ def test_a_long_track_is_thinned_evenly_and_bounded() -> None:
     assert track.seen == 5 * LIMIT + 3
 
 
+def test_a_thinned_track_does_not_keep_the_pieces_that_it_was_taken_from() -> None:
+    track = line(5 * LIMIT + 3)
+    before = track.count
+    for k in range(1, 4):
+        piece = np.arange(8 * LIMIT) * 1_000_000 + k * 10**15
+        track.add(piece, np.zeros((len(piece), 3)))
+        assert all(part.base is None or part.base.nbytes < piece.nbytes for part in (*track._t, *track._p))
+    assert track.count <= LIMIT < 2 * before
+
+
 def test_a_turned_and_moved_track_has_no_error() -> None:
     found = compared(line(500, turn=1.0, start=3.0), line(500), "origin-yaw")
     assert found is not None

@@ -63,9 +63,11 @@ class Trace:
         turn = np.full((len(t_ns), 4), np.nan) if quat_wxyz is None else quat_wxyz[keep]
         first = -self.seen % self._stride
         self.seen += len(t_ns)
-        self._t.append(t_ns[first :: self._stride])
-        self._p.append(positions[first :: self._stride])
-        self._q.append(turn[first :: self._stride])
+        kept = slice(first, None, self._stride)
+        # Copies: a view would keep every row of its piece in memory.
+        self._t.append(t_ns[kept].copy())
+        self._p.append(positions[kept].copy())
+        self._q.append(turn[kept].copy())
         self.count += len(self._t[-1])
         while self.count > LIMIT:
             self._t, self._p, self._q = [self.t_ns[::2]], [self.positions[::2]], [self.quat_wxyz[::2]]

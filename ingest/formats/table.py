@@ -144,7 +144,10 @@ def _blocks(files: list[_File], report: ReportBuilder) -> Iterator[tuple[str, pl
         before = report.kept
         yield from file.blocks()
         if report.kept == before:
-            raise MarchaError(f"{file.path}: no row of it has a time and a value; does the mapping fit?")
+            said = next((f" ({f.detail})" for f in report.build().findings if f.kind == "bad_row"), "")
+            raise MarchaError(
+                f"{file.path}: no row of it has a time and a value{said}; does the mapping fit?"
+            )
 
 
 def _only(values: pl.Series, where: pl.Series) -> pl.Series:
@@ -240,6 +243,7 @@ class _File:
                     columns[name] = self._column(name, target, text, lines, topic.name if many else name)
         frame = pl.DataFrame(columns)
         most = MOST_NS // self._tick
+        read = frame["t"].is_not_null()
         frame = frame.with_columns(t=pl.when(pl.col("t").is_between(-most, most)).then("t"))
         values = [c for c in frame.columns if c not in ("t", "line")]
         timeless = frame["t"].is_null()
@@ -248,7 +252,8 @@ class _File:
             text = "" if self._time_at is None else block[f"c{self._time_at}"][first]
             self._report.drop(
                 "bad_row",
-                f"{self.path.name}: {text!r} is no time ({self._time.unit}); row dropped",
+                f"{self.path.name}: {text!r} is {'beyond any clock' if read[first] else 'no time'} "
+                f"({self._time.unit}); row dropped",
                 count=int(timeless.sum()),
                 line=lines[first],
             )
