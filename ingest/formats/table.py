@@ -144,9 +144,9 @@ def _blocks(files: list[_File], report: ReportBuilder) -> Iterator[tuple[str, pl
         before = report.kept
         yield from file.blocks()
         if report.kept == before:
-            said = next((f" ({f.detail})" for f in report.build().findings if f.kind == "bad_row"), "")
+            reason = next((f" ({f.detail})" for f in report.build().findings if f.kind == "bad_row"), "")
             raise MarchaError(
-                f"{file.path}: no row of it has a time and a value{said}; does the mapping fit?"
+                f"{file.path}: no row of it has a time and a value{reason}; does the mapping fit?"
             )
 
 
