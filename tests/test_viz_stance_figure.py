@@ -55,7 +55,7 @@ def test_the_viewer_has_a_lane_for_each_condition_and_says_first_what_must_not_b
     made = simulate("rectangle", tmp_path, seed=1, laps=3, config="3030")
     convert(made.paths, tmp_path / "clipped.mcap")
     out = tmp_path / "out.mcap"
-    runs = ["foot.15iez-zaru", "foot.9iez[detector=c1c2c3]"]
+    runs = ["foot.15iez-zaru[unclip=false]", "foot.9iez[detector=c1c2c3]"]
     results = replay(
         mr.open(tmp_path / "clipped.mcap"), runs, inputs=["/foot/imu2"], out=out, metrics=False
     ).runs

@@ -249,36 +249,36 @@ def verdict(s: Any, p: Any) -> list[Remark]:
         )
     result += _against_the_gait(s)
     result += _against_the_filter(s)
+    return result + _clipped(s)
+
+
+def _clipped(s: Any) -> list[Remark]:
+    """Return which columns stand at their extreme, or flatten below it, and what was put back of a turn."""
+    v, result = s.verdict, []
     swing_rows = max(1, s.taken - s.n_still)
     for i, column in enumerate(IMU_COLUMNS):
-        for value, count in ((s.lowest[i], v.at_lowest[i]), (s.highest[i], v.at_highest[i])):
+        for side, (value, count) in enumerate(
+            ((s.highest[i], v.at_highest[i]), (s.lowest[i], v.at_lowest[i]))
+        ):
+            axis = s.ceiling.axes[i - 3] if i >= 3 else None
+            turns = int(axis["count"][side]) if axis is not None else 0
+            where = ""
             if count >= CLIPPED_SAMPLES and abs(value) > LEAST_CEILING[i]:
-                result.append(
-                    Remark(
-                        "clipped",
-                        f"{column} stands at its extreme {value:.4g} in {count} rows "
-                        f"({count / swing_rows:.1%} of those in swings): the sensor's range is too small for "
-                        "this walk, turns and speeds in the swing are underestimated",
-                    )
+                share = f"{count / swing_rows:.1%} of those in swings"
+                where = f"{column} stands at its extreme {value:.4g} in {count} rows ({share})"
+            elif axis is not None and turns >= CLIPPED_SAMPLES:
+                where = f"{column} flattens near {math.copysign(axis['level'][side], value):.3g} rad/s in {turns} turns"
+            if not where:
+                continue
+            what = "turns and speeds in the swing are underestimated"
+            if axis is not None and turns > 0:
+                what = (
+                    f"{axis['angle'][side]:.2f} rad of {turns} turns were put back from the slopes on both sides, "
+                    "right to about 45 %"
                 )
-    return result + _put_back(s)
-
-
-def _put_back(s: Any) -> list[Remark]:
-    """Return which axes stop at a ceiling again and again, and what was put back of their turns."""
-    result: list[Remark] = []
-    for i, column in enumerate(IMU_COLUMNS[3:]):
-        for side, sign in enumerate((1.0, -1.0)):
-            count, angle, level = (s.ceiling.axes[i][name][side] for name in ("count", "angle", "level"))
-            if count >= CLIPPED_SAMPLES:
-                result.append(
-                    Remark(
-                        "clipped",
-                        f"{column} flattens near {sign * level:.3g} rad/s in {count} turns: the sensor's range is too "
-                        f"small for this walk; {angle:.2f} rad were put back from the slopes on both sides, right to "
-                        "about 45 %",
-                    )
-                )
+            result.append(
+                Remark("clipped", f"{where}: the sensor's range is too small for this walk, {what}")
+            )
     return result
 
 
