@@ -46,6 +46,9 @@ class Score:
         Squared error of the end, in its own sigmas, heading laid on the first three metres; NaN without a reference.
     track : ndarray, shape (n, 4)
         Seconds and positions.
+    longer : float
+        Way from stance to stance over the reference's at the same instants (footprints: from print to print), less
+        one; NaN without a reference. The way of all samples would compare the reference's noise.
     """
 
     error_m: float
@@ -55,6 +58,7 @@ class Score:
     remarks: list[Remark]
     squared: float = np.nan
     track: FloatArray = field(default_factory=lambda: np.empty((0, 4)))
+    longer: float = np.nan
 
     @property
     def fatal(self) -> bool:
@@ -117,7 +121,9 @@ def estimate(walk: Walk, name: str, **params: Any) -> Score:
     steps = int(np.isfinite(out[:, index["step.index"]]).sum())
     way = float(np.hypot(*np.diff(p[:, :2], axis=0).T).sum())
     error, squared = _error(walk, t, p), _squared(walk, t, p, sigma)
-    return Score(error, way, float(p[-1, 2] - p[0, 2]), steps, remarks, squared, np.column_stack([t, p]))
+    track, still = np.column_stack([t, p]), out[is_navigated, index["stance.still"]] > 0.5
+    longer = _longer(walk, t, p, still)
+    return Score(error, way, float(p[-1, 2] - p[0, 2]), steps, remarks, squared, track, longer)
 
 
 def _matched(walk: Walk, t: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -136,6 +142,24 @@ def _error(walk: Walk, t: np.ndarray, p: np.ndarray) -> float:
     if walk.closed:
         return float(np.hypot(*(p[-1] - p[0])[:2]))
     return abs(float(p[-1, 2] - p[0, 2]) - walk.climb)
+
+
+def _longer(walk: Walk, t: np.ndarray, p: np.ndarray, still: np.ndarray) -> float:
+    if walk.flat:
+        mine, true = _matched(walk, t, p)
+    else:
+        edges = np.diff(still.astype(int), prepend=0, append=0)
+        first, end = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+        middle = ((first + end) // 2)[end - first >= 4]
+        low, high = walk.truth_t.min(initial=np.inf), walk.truth_t.max(initial=-np.inf)
+        middle = middle[(t[middle] >= low) & (t[middle] <= high)]
+        if not middle.size:
+            return np.nan
+        mine = p[middle]
+        true = np.column_stack([np.interp(t[middle], walk.truth_t, c) for c in walk.truth.T])
+    ways = [np.hypot(*np.diff(x[:, :2], axis=0).T) for x in (mine, true)]
+    is_stride = ways[1] > 0.3
+    return float(ways[0][is_stride].sum() / ways[1][is_stride].sum() - 1.0) if is_stride.any() else np.nan
 
 
 def _squared(walk: Walk, t: np.ndarray, p: np.ndarray, sigma: np.ndarray) -> float:
@@ -207,6 +231,7 @@ def main() -> int:
     if not (options.data / "foot").is_dir():
         parser.error(f"{options.data / 'foot'}: no such folder; name the data by --data or MARCHA_DATA")
     broken = 0
+    longer: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as temporary:
         recordings = [
             w
@@ -219,6 +244,7 @@ def main() -> int:
         for walk in recordings:
             if not options.changed:
                 score = estimate(walk, options.estimator)
+                longer[walk.name] = score.longer
                 print(_row(walk, score), promise(walk, score), flush=True)
                 broken += bool(promise(walk, score))
                 continue
@@ -226,6 +252,8 @@ def main() -> int:
                 print(_row(walk, score), change, "| WRONG: " + wrong if wrong else "", flush=True)
                 broken += bool(wrong)
     print(f"{broken} promises broken")
+    ratios = ", ".join(f"{name} {100 * value:+.1f}" for name, value in longer.items() if np.isfinite(value))
+    print(f"% longer than the reference from stance to stance: {ratios}" if ratios else "no reference")
     return int(bool(broken))
 
 
