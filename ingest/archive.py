@@ -17,7 +17,10 @@ from ..recording.scratch import scratch_folder
 
 UNPACK_LIMIT_GB = 2.0
 """Total that an archive may unpack to, unless an option raises it."""
-DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, RuntimeError, EOFError, ValueError)
+DAMAGED = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, RuntimeError, EOFError, ValueError),
+    MemoryError,  # a dictionary of LZMA may be as large as its member says
+)
 """What :mod:`zipfile` raises on archives that are damaged, or packed in a way that it does not know."""
 MEMBERS, NAME_BYTES = 10_000, 200
 """Most members, and bytes of one part of a name."""
@@ -81,7 +84,8 @@ def unpack(path: Path, folder: Path, limit_gb: float = UNPACK_LIMIT_GB) -> None:
                         out.write(chunk)
     except DAMAGED as error:
         shutil.rmtree(folder, ignore_errors=True)
-        raise MarchaError(f"{path}: the zip archive cannot be unpacked: {error}") from error
+        reason = str(error) or "it asks for more memory than there is"
+        raise MarchaError(f"{path}: the zip archive cannot be unpacked: {reason}") from error
     except OSError as error:
         raise MarchaError(f"{path}: cannot be unpacked: {error.strerror or error}") from error
 

@@ -71,7 +71,8 @@ def _require_small(path: Path) -> None:
                         "stands far from the table, or save it as CSV"
                     )
     except (OSError, *DAMAGED) as error:
-        raise MarchaError(f"{path}: cannot be read as a spreadsheet: {error}") from error
+        reason = str(error) or "it asks for more memory than there is"
+        raise MarchaError(f"{path}: cannot be read as a spreadsheet: {reason}") from error
 
 
 def _reach(sheet: bytes) -> int:

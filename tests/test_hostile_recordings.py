@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import resource
 import signal
 import stat
 import struct
@@ -189,6 +190,24 @@ def test_an_encrypted_member_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.zip").write_bytes(data)
     with pytest.raises(MarchaError, match="encrypted"):
         convert(tmp_path / "a.zip", tmp_path / "out.mcap")
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="limits its memory")
+def test_a_dictionary_of_any_size_is_one_line(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("walk.csv", GOOD)
+    data = bytearray((tmp_path / "a.zip").read_bytes())
+    place = 30 + len("walk.csv") + 4 + 1  # local header, version and length of the properties, lc lp pb
+    data[place : place + 4] = b"\xff" * 4
+    (tmp_path / "a.zip").write_bytes(data)
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    held = int(Path("/proc/self/status").read_text().split("VmData:")[1].split()[0]) * 1024
+    resource.setrlimit(resource.RLIMIT_DATA, (held + (1 << 30), before[1]))
+    try:
+        with pytest.raises(MarchaError, match="more memory than there is"):
+            convert(tmp_path / "a.zip", tmp_path / "out.mcap")
+    finally:
+        resource.setrlimit(resource.RLIMIT_DATA, before)
 
 
 def test_a_bomb_is_refused_unless_an_option_raises_the_limit(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import re
 import shutil
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -29,10 +29,6 @@ WARM = 4
 
 TOGETHER = 256
 """Inputs of one target that run in one process, which loads what draws (a second) anew."""
-FEW = 1000
-"""Inputs up to which all targets have as many: a run of so few is the same on every machine."""
-MOST_TURNS = 12
-"""Of a cheap target while a costly one has one: each gets about the same processor time."""
 
 
 @dataclass
@@ -101,16 +97,8 @@ def generator(seed: int, target: str, number: int) -> Rng:
     return np.random.default_rng([seed, *target.encode(), number])
 
 
-def prepare(place: Path, warm_inputs: int = WARM) -> tuple[Seeds, dict[str, float]]:
-    """Make the sound inputs in a process of its own, and load here what that process had loaded.
-
-    Returns
-    -------
-    Seeds
-        The sound inputs.
-    dict of str to float
-        Processor time (s) that an input of each target takes.
-    """
+def prepare(place: Path, warm_inputs: int = WARM) -> Seeds:
+    """Make the sound inputs in a process of its own, and load here what that process had loaded."""
 
     def warm() -> object:
         from . import seeds, targets
@@ -118,16 +106,11 @@ def prepare(place: Path, warm_inputs: int = WARM) -> tuple[Seeds, dict[str, floa
         sound = seeds.make(place / "seeds")
         with emptied(place) as folder:
             targets.warm(sound, folder)
-        taken = {}
         for target in {t.name: t for t in targets.targets(sound)}.values():
-            began = 0.0
-            for number in range(warm_inputs + 1):
-                if number == 1:  # the first one loads what it needs
-                    began = time.process_time()
+            for number in range(warm_inputs):
                 with emptied(place) as folder, contextlib.suppress(BaseException):
                     target.run(generator(0, target.name, number), folder)
-            taken[target.name] = max(1e-4, (time.process_time() - began) / warm_inputs)
-        return (sound, taken), *loaded()
+        return sound, *loaded()
 
     result, verdict = in_child(warm, cpu_s=600, memory=4 << 30)
     if result is None or verdict.kind:
@@ -138,11 +121,9 @@ def prepare(place: Path, warm_inputs: int = WARM) -> tuple[Seeds, dict[str, floa
     return made
 
 
-def in_turn(known: Sequence[Target], taken: Mapping[str, float]) -> list[Target]:
+def in_turn(known: Sequence[Target]) -> list[Target]:
     """Return the targets in the order of their inputs: all once, then the cheaper ones again and again."""
-    long = float(np.quantile([taken[t.name] for t in known], 0.9))
-    turns = [min(MOST_TURNS, max(1, round(long / taken[t.name]))) for t in known]
-    return [t for k in range(max(turns)) for t, n in zip(known, turns, strict=True) if k < n]
+    return [t for k in range(max(t.turns for t in known)) for t in known if k < t.turns]
 
 
 def run(
@@ -176,10 +157,8 @@ def run(
     """
     began = time.monotonic()
     with scratch() as place:
-        sound, taken = prepare(place, min(WARM, 1 + inputs // 1000))
-        chosen = _chosen(sound, only)
-        if inputs > FEW:
-            chosen = in_turn(chosen, taken)
+        sound = prepare(place, min(WARM, 1 + inputs // 1000))
+        chosen = in_turn(_chosen(sound, only))
         result = Result()
         if jobs == 1:
             result = _share(chosen, place, range(first, first + inputs), seed, keep, log)

@@ -39,10 +39,14 @@ _WROTE = (0, 3, 4)
 
 @dataclass(frozen=True)
 class Target:
-    """A kind of input: ``run`` makes the input of a random generator in a folder, and judges what came of it."""
+    """A kind of input: ``run`` makes the input of a random generator in a folder, and judges what came of it.
+
+    A cheap one has several ``turns`` while a costly one has one.
+    """
 
     name: str
     run: Callable[[Rng, Path], None]
+    turns: int = 1
 
 
 def call(folder: Path, action: Callable[[], Any], output: Path | None = None) -> Any:
@@ -178,7 +182,7 @@ def importing(sample: Sample) -> Target:
                 {t: r for t, r in found.items() if not t.startswith(WHOLE)}, sample.rows, 2 + 3 * done.rows
             )
 
-    return Target(f"import {sample.format} {sample.name}", run)
+    return Target(f"import {sample.format} {sample.name}", run, turns=4)
 
 
 def _chosen(rng: Rng, sample: Sample) -> str:
@@ -335,7 +339,7 @@ def configuring(files: dict[str, bytes]) -> Target:
         path.write_bytes(mutators.toml(rng, files[str(pick(rng, sorted(files)))]).data)
         call(folder, lambda: config.load(path))
 
-    return Target("study toml", run)
+    return Target("study toml", run, turns=4)
 
 
 def calibrating(rec: bytes) -> Target:
