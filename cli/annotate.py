@@ -81,23 +81,25 @@ def by_eye(
     session = Session(rec, where.target(rec), action="page" if page else "viewer", **where.how)
     if session.taken_up:
         complain(f"took up {session.taken_up} edits of an earlier session from {session.draft}")
-    if page:
-        annotate_page(
-            session,
-            video=video,
-            video_offset_s=video_offset,
-            open_browser=browser,
-            opened=lambda server: complain(f"the page is at {server.address}; Ctrl-C ends it"),
-        )
-    else:
-        annotate_in_viewer(
-            session,
-            say=complain,
-            opened=lambda window: complain(f"the viewer is at {window.address}"),
-        )
-    left = session.unsaved
-    if left:
-        complain(f"{left} annotations are not saved; {session.draft} keeps them for the next session")
+    try:
+        if page:
+            annotate_page(
+                session,
+                video=video,
+                video_offset_s=video_offset,
+                open_browser=browser,
+                opened=lambda server: complain(f"the page is at {server.address}; Ctrl-C ends it"),
+            )
+        else:
+            annotate_in_viewer(
+                session,
+                say=complain,
+                opened=lambda window: complain(f"the viewer is at {window.address}"),
+            )
+    finally:
+        left = session.unsaved
+        if left:
+            complain(f"{left} annotations are not saved; {session.draft} keeps them for the next session")
     document = {"output": str(session.out), "annotations": len(session.rows), "unsaved": left}
     return Outcome(document, [Heading(f"{session.out}: {len(session.rows)} annotations, {left} not saved")])
 

@@ -385,9 +385,12 @@ def test_a_page_that_does_not_know_the_newest_state_is_given_all_of_it(server: P
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals")
-def test_the_program_ends_by_ctrl_c_and_says_what_is_not_saved(path: Path) -> None:
-    code = "import sys; from marcha.cli import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, "annotate", str(path), "--page", "--no-browser", "--in-place"]
+@pytest.mark.parametrize(("ending", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_the_program_ends_by_ctrl_c_and_says_what_is_not_saved(
+    path: Path, ending: signal.Signals, code: int
+) -> None:
+    run = "import sys; from marcha.cli import main; sys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", run, "annotate", str(path), "--page", "--no-browser", "--in-place"]
     program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert program.stderr is not None
     address = program.stderr.readline().split()[5].rstrip(";")
@@ -398,10 +401,10 @@ def test_the_program_ends_by_ctrl_c_and_says_what_is_not_saved(path: Path) -> No
         connection.request("POST", f"/api/{name}", json.dumps({"add": [row]}), {"X-Marcha-Token": token})
         assert connection.getresponse().read()
     connection.close()
-    program.send_signal(signal.SIGINT)
+    program.send_signal(ending)
     out, err = program.communicate(timeout=30)
-    assert program.returncode == 0
+    assert program.returncode == code
     assert err.startswith("marcha: 1 annotations are not saved; ")
-    assert out == f"{path}: 2 annotations, 1 not saved\n"
+    assert out == ("" if code else f"{path}: 2 annotations, 1 not saved\n")
     assert len(stored(path)) == 1
     assert len(session(path).rows) == 2

@@ -46,5 +46,6 @@ def annotate_page(
             webbrowser.open(server.address)
         try:
             server.wait()
-        except KeyboardInterrupt:
-            return
+        except KeyboardInterrupt as ending:
+            if type(ending) is not KeyboardInterrupt:  # Ctrl-C ends a session, SIGTERM the program
+                raise

@@ -259,8 +259,9 @@ def annotate_in_viewer(
             _mark(session, stream, window, say, opened)
             if window.running:
                 finish(stream)
-        except KeyboardInterrupt:
-            pass
+        except KeyboardInterrupt as ending:
+            if type(ending) is not KeyboardInterrupt:  # Ctrl-C ends a session, SIGTERM the program
+                raise
         except RuntimeError:  # Rerun's thread towards the viewer is gone
             if window.running:
                 raise
