@@ -308,6 +308,11 @@ def test_the_hybrid_lies_between_its_parts():
     assert alone[-1] > 2.0
     assert fused[-50:].mean() < alone[-50:].mean()
     assert fused.mean() < alone.mean() or fused.mean() < fixes.mean()
+    # a window's powers speak of its middle: fixes that are moved by half of its steps do not lag
+    moved = errors(
+        drive(make("indoor.hybrid", **params, move_fix=True), tables, attachments=table())["position"], path
+    )
+    assert moved.mean() < fused.mean()
 
 
 def test_anchor_tables_name_the_line():

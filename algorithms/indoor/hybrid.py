@@ -28,6 +28,14 @@ class FusionParams(RangingParams, frozen=True, kw_only=True):
         float, meta("variance of a trilaterated position, each axis", "m²", f"{SOURCE}, table 5.5", gt=0)
     ] = 1.0
     p0: Annotated[float, meta("variance of a known start", "m²", "not given in the source", ge=0)] = 1.0
+    move_fix: Annotated[
+        bool,
+        meta(
+            "move a fix by half of the window's steps: powers of a window speak of its middle (not in the "
+            "source)",
+            "",
+        ),
+    ] = False
     known_start: Annotated[
         bool, meta("start at start_x, start_y of the plan; else the first fix starts the track", "")
     ] = False
@@ -73,6 +81,7 @@ class IndoorHybrid(PlainEstimator):
         self.windows = Windows(p, anchors_of(context, without=p.without))
         self.steps = SourceSteps(p, context)
         self.at = np.array([p.start_x, p.start_y]) if p.known_start else np.full(2, np.nan)
+        self.last = self.at.copy()  # at the end of the last window
         self.variance = p.p0
         self.fixes = 0
 
@@ -86,6 +95,7 @@ class IndoorHybrid(PlainEstimator):
             results += ranging_results(self.windows, closed)
             if fix is not None:
                 self.update(fix[0])
+            self.last = self.at.copy()
             results += self.answer(closed.end_ns)
         if message.input == "radio":
             self.windows.power(str(message.values[0]), float(message.values[1]))
@@ -105,6 +115,8 @@ class IndoorHybrid(PlainEstimator):
         if np.isnan(self.at).any():
             self.at, self.variance = fix.copy(), self.params.r
             return
+        if self.params.move_fix:
+            fix = fix + 0.5 * (self.at - self.last)
         gain = self.variance / (self.variance + self.params.r)
         self.at = self.at + gain * (fix - self.at)
         self.variance *= 1.0 - gain

@@ -116,15 +116,15 @@ def _shift(c: Any, i: int, dx: float, dy: float) -> None:
 
 
 @compiled
-def _turn(c: Any, i: int, dt: float) -> None:
-    """Let the side on which a carrier hears stronger turn, or be forgotten."""
+def _turn(c: Any, i: int, dt: float, likes: float, steady: float) -> None:
+    """Let the side on which a carrier hears stronger turn; the share ``likes`` or ``steady`` of it is not forgotten."""
     s = c.s[0]
     p = c.p[i]
     if uniform(s) < dt / DOUBT_S:
         draw_turning(c, i)
     if p[PATTERN] <= 0.0:
         return
-    keep = math.exp(-dt / (s.pattern_s if p[RATE] == 0.0 else STEADY_S))
+    keep = likes if p[RATE] == 0.0 else steady
     x, y, xx, xy, yy = p[AHEAD_X], p[AHEAD_Y], p[V_XX], p[V_XY], p[V_YY]
     if p[RATE] != 0.0:
         p[RATE] += 0.02 * math.sqrt(dt) * normal(s)
@@ -171,12 +171,13 @@ def _drift(c: Any, t_ns: int) -> None:
     draw = s.speed * math.sqrt(1.0 - keep * keep)
     walk = s.drift * math.sqrt(dt)
     gain = 0.005 * math.sqrt(dt)
+    likes, steady = math.exp(-dt / s.pattern_s), math.exp(-dt / STEADY_S)
     for i in range(c.p.shape[0]):
         p = c.p[i]
         if p[GAIN] != 0.0:
             p[GAIN] += gain * normal(s)
         if s.turning > 0.0:
-            _turn(c, i, dt)
+            _turn(c, i, dt, likes, steady)
         if c.levels.size > 1:
             _climb(c, i, dt)
         if s.walking == 1:
