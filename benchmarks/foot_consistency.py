@@ -30,7 +30,7 @@ from .foot_walks import estimate, walks
 FILTERS = ("foot.9iez", "foot.15iez-zaru", "foot.ukf", "foot.9iez-kf", "foot.9iez-mad")
 REAL = ("foot.9iez", "foot.15iez-zaru", "foot.rts")
 SCENARIOS = ("rectangle", "figure-eight", "stairs", "straight")
-SEEDS = range(3001, 3041)
+SEEDS = range(4001, 4041)
 INSIDE = float(chi2.ppf(0.95, 3))
 
 

@@ -102,10 +102,10 @@ class Foot9IezParams(FootParams, frozen=True, forbid_unknown_fields=True, kw_onl
         meta(
             "Standard deviation of roll and pitch after the rest, at least",
             "rad",
-            "ours; P0 = 0 in the source",
+            "ours: an accelerometer off by 5 to 6 mg; P0 = 0 in the source",
             ge=0.0,
         ),
-    ] = 0.003
+    ] = 0.0055
     pivot_below_m: Annotated[
         float,
         meta(
