@@ -132,3 +132,15 @@ def test_panels_of_a_walk_are_never_empty(recs: dict[str, mr.Recording]) -> None
     bare = {ax.get_title(loc="left") for ax in viz.figure(recs["indoor"]).axes}
     sensed = any("acc_x" in c.columns for c in recs["indoor"].channels.values())
     assert any("accelerometer" in title for title in bare) == sensed
+
+
+def test_labels_of_near_places_do_not_cover_each_other() -> None:
+    from marcha.viz.plan_figures import place_labels
+    from matplotlib.figure import Figure
+
+    ax = Figure(figsize=(6, 4)).subplots()
+    where = np.array([[1.0, 1.0], [1.3, 1.05], [4.0, 2.0], [4.1, 2.2]])
+    ax.plot(where[:, 0], where[:, 1], "s")
+    boxes = place_labels(ax, [(f"a0:e6:f8:00:00:0{k}", at) for k, at in enumerate(where)])
+    assert len(boxes) == len(where)
+    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
