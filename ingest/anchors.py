@@ -85,9 +85,10 @@ def layout_of(
 
 def is_anchor_header(header: TableHeader) -> bool:
     """Whether a header names addresses and places, and neither times nor powers of a log."""
-    there = set(_roles(header))
-    placed = {"x", "y"} <= there or {"lat", "lon"} <= there
-    return "mac" in there and placed and not header.roles(NOT_ANCHORS)
+    there = set(header.roles(ANCHOR_ROLES))
+    if not ({"x", "y"} <= there or {"lat", "lon"} <= there):
+        return False  # most tables; a column that may be an address does not make one a place
+    return "mac" in set(_roles(header)) and not header.roles(NOT_ANCHORS)
 
 
 def doubt_of_header(head: bytes) -> str:

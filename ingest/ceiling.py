@@ -47,7 +47,12 @@ class CeilingSearch:
         starts = np.concatenate(([0], np.flatnonzero(np.diff(negative)) + 1, [len(values)]))
         heights = np.abs(values)
         tallest = np.maximum.reduceat(heights, starts[:-1])
-        for k, height in enumerate(tallest.tolist()):
+        # Most half-waves of a walk are low: only those that may count, and both edges, are looked at one by one.
+        least = np.where(negative[starts[:-1]], self._highest[False], self._highest[True])
+        high = tallest >= np.maximum(LEAST_RATE, SHOULDER * least)
+        high[0] = high[-1] = True
+        for k in np.flatnonzero(high).tolist():
+            height = float(tallest[k])
             positive = not negative[starts[k]]
             at_edge = k == 0 or k == len(tallest) - 1
             if not at_edge and height < max(LEAST_RATE, SHOULDER * self._highest[positive]):

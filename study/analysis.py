@@ -6,6 +6,7 @@ configuration), and stays out of every pooled group.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -104,9 +105,15 @@ def order(frame: pl.DataFrame, config: cfg.StudyConfig) -> dict[str, list[str]]:
     listed = {
         "filter": dict.fromkeys(m.label for m in methods),
         **{f: dict.fromkeys(m.levels[f] for m in methods) for f in cfg.factor_names(config)},
-        "configuration": dict.fromkeys(sorted(present["configuration"])),
+        "configuration": dict.fromkeys(sorted(present["configuration"], key=by_number)),
     }
     return {f: [level for level in listed[f] if level in present[f]] for f in factors(config)}
+
+
+def by_number(label: str) -> list[tuple[int, str]]:
+    """Return a key that puts ``50 m`` before ``100 m``."""
+    parts = re.split(r"(\d+)", label)
+    return [(int(part), "") if k % 2 else (0, part) for k, part in enumerate(parts)]
 
 
 def _subset(frame: pl.DataFrame, subset: str) -> pl.DataFrame:

@@ -22,7 +22,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogFormatter
 
 from . import config as cfg
-from .analysis import order
+from .analysis import by_number, order
 from .cells import StudyCell
 from .pairs import subsets
 from .report import NEES_TITLES
@@ -248,7 +248,7 @@ def tracks(cells: Sequence[StudyCell], config: cfg.StudyConfig) -> Figure | None
             drawn.setdefault((cell.label, cell.configuration), []).append(cell)
     if not drawn:
         return None
-    labels, configurations = {f for f, _ in drawn}, sorted({c for _, c in drawn})
+    labels, configurations = {f for f, _ in drawn}, sorted({c for _, c in drawn}, key=by_number)
     filters = [f for f in dict.fromkeys(m.label for m in cfg.methods(config)) if f in labels]
     # One filter on many configurations goes across the page, not down.
     across = len(filters) < 3 < len(configurations)
@@ -316,7 +316,7 @@ def level_tracks(cells: Sequence[StudyCell], config: cfg.StudyConfig, factor: st
         return None
     names = dict.fromkeys(m.levels[factor] for m in cfg.methods(config))
     names = [n for n in names if any(c.levels[factor] == n for c in drawn)]
-    rows = sorted({c.configuration for c in drawn})
+    rows = sorted({c.configuration for c in drawn}, key=by_number)
     figure = Figure(figsize=(0.8 + 3.2 * len(names), 0.9 + 3.2 * len(rows)))
     axes = figure.subplots(len(rows), len(names), squeeze=False)
     for i, row in enumerate(rows):

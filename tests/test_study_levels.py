@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 from marcha.study import figures
+from marcha.study.analysis import by_number
 from marcha.study.config import load
 from marcha.study.gallery import drawings
 
@@ -88,3 +89,13 @@ def test_few_walks_a_configuration_have_one_q_q_plot_together() -> None:
     drawn = figures.qq(frame, config)
     assert drawn is not None
     assert [ax.get_title() for ax in drawn.axes] == ["all configurations"]
+
+
+def test_configurations_are_ordered_by_their_numbers() -> None:
+    assert sorted(["100 m", "C10", "50 m", "C9", "10 m"], key=by_number) == [
+        "10 m",
+        "50 m",
+        "100 m",
+        "C9",
+        "C10",
+    ]
