@@ -80,7 +80,8 @@ def replay(
         File of `marcha calibrate`, handed to the estimators; may be repeated.
     withhold : str
         TOPIC=START:LENGTH, an artificial loss of a signal: messages that no estimator is given, such as
-        /phone/gnss=120:60s; may be repeated. The metrics say how far off the track is at its end.
+        /phone/gnss=120:60s (and with it the receiver's velocity); may be repeated. The metrics say how far off
+        the track is at its end.
     survey : Path
         Recording of fixes along the same route at another time; tracks are measured by their distance to it.
     output : Path
