@@ -24,13 +24,13 @@ EVENTS = 16
 """Steps and fixes that one message is answered with at most; what is more follows with the next."""
 
 FIELDS: list[tuple[Any, ...]] = [
+    ("role", "i8", (6,)),  # first: numba warns where one record begins as another one does
     *steps.FIELDS,
     *attitude.FIELDS,
     *direction.FIELDS,
     *lengths.FIELDS,
     *geodesy.ORIGIN,
     *mixture.FIELDS,
-    ("role", "i8", (6,)),
     ("fused", "i8"),
     ("has_gyr", "i8"),
     ("mag_prior", "f8", (2,)),  # sigma and share of wrong of the first magnetic heading; 0 none
