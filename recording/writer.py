@@ -60,7 +60,7 @@ def qos_profile(topic: str) -> str:
     return _QOS.format(durability="transient_local" if topic == "/tf_static" else "volatile")
 
 
-EVENT_ROWS = 16384
+EVENT_ROWS = 4096
 """Annotations that are encoded together: their texts take a kilobyte each while they are."""
 
 
