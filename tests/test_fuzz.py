@@ -97,6 +97,16 @@ def test_tasks_in_one_process_end_with_the_first_that_fails(task: Callable[[], o
     assert together([task, dict])[0] == []
 
 
+def test_what_inputs_before_it_hold_is_not_counted_against_an_input() -> None:
+    """Modules that commands of earlier inputs had loaded once took the limit of later ones: a failure after others."""
+    kept: list[bytes] = []
+    went_well, said = together([lambda: kept.append(b"x" * 300_000_000)] * 3)
+    assert len(went_well) == 3, said
+    went_well, said = together([dict, lambda: kept.append(b"x" * 600_000_000)])
+    assert len(went_well) == 1
+    assert said.startswith("memory")
+
+
 def test_a_failure_among_others_is_that_of_its_input(tmp_path: Path) -> None:
     """Numbers 5 and 17 fail in different ways, 9 only where another ran before it in the same process."""
     ran: list[int] = []
