@@ -46,6 +46,7 @@ WORK: list[Any] = [
     ("axis_sd", "f8", (2,)),  # rad
     ("pos_sd", "f8"),  # m, across the axis
     ("pairing", "f8"),  # share of the better sign in the misfit of both, 0.5 … 1
+    ("hand", "i8"),  # sensors whose axes are left-handed: 0 none, 1 the upper, 2 the lower, 3 both
     ("turn_rms", "f8"),  # rad/s, of the relative turn about the axis
     ("rate_rms", "f8", (2,)),
     ("level", "f8"),  # share of gravity across the axis, root mean square

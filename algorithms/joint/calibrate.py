@@ -13,12 +13,13 @@ import numpy as np
 from ..calibration import Calibration, Calibrator, Stretch
 from ..contract import AlgorithmError, FloatArray, Input
 from ..parameters import meta
-from . import axisfit, vectorfit
+from . import axisfit, handedness, hingefit, vectorfit
 from .common import (
     IMU_COLUMNS,
     given_mount,
     imu,
     joint_name,
+    mirrored_remark,
     mount_of,
     per_segment,
     vector,
@@ -78,9 +79,9 @@ class JointCalibrator(Calibrator):
 
     Values: ``hinges``, one per pair of neighbouring segments (``joint``, ``segments``, ``axes`` in both sensors'
     frames, ``axes_sd_deg``, ``positions_m`` from the joint's centre to each sensor, ``position_sd_m``, ``pairing``,
-    ``gyr_bias_rad_s``, ``acc_bias_m_s2``, ``mean_force_m_s2``, ``skewness``, ``long_axes_guessed``, ``usable``,
-    ``why``), and ``rot_sb_<segment>``, the rotation from the sensor's to the segment's frame (x flexion axis, z long
-    axis upwards, y = z × x), row by row.
+    ``gyr_bias_rad_s``, ``acc_bias_m_s2``, ``biases_bounded``, ``mean_force_m_s2``, ``skewness``,
+    ``long_axes_guessed``, ``usable``, ``why``), and ``rot_sb_<segment>``, the rotation from the sensor's to the
+    segment's frame (x flexion axis, z long axis upwards, y = z × x), row by row.
     """
 
     name: ClassVar[str] = "joint"
@@ -109,6 +110,11 @@ class JointCalibrator(Calibrator):
             if not hinge["usable"]:
                 remarks.append(f"{hinge['joint']}: not observable: {hinge['why']}")
                 continue
+            if hinge["biases_bounded"]:
+                remarks.append(
+                    f"{hinge['joint']}: what does not fit a hinge looks like a bias larger than sensors have: tissue "
+                    "moves, or the joint turns about more than one axis"
+                )
             for segment, axis in zip(hinge["segments"], hinge["axes"], strict=True):
                 if segment not in axes or hinge["joint"] == "knee":
                     axes[segment] = np.array(axis)
@@ -157,6 +163,8 @@ class JointCalibrator(Calibrator):
                 **result,
                 "why": f"{len(rows)} samples in common of at least 60 (do their times overlap?)",
             }
+        judged = np.zeros(1, handedness.PAIR)
+        handedness.look_through(judged[0], rows, 1.0 / rate)
         step = max(1, math.ceil(len(rows) / MOST_ROWS))
         rows = np.ascontiguousarray(rows[::step])
         work = np.zeros(1, axisfit.WORK_DTYPE)
@@ -191,18 +199,28 @@ class JointCalibrator(Calibrator):
             best = vectorfit.fit(stretches, best.axes, p.band_hz, p.sd_gyr, p.sd_acc)
         w["axis"] = best.axes
         skew = skewness(work[0], rows, len(rows), lag)
+        if w["pairing"] < hingefit.DOUBTFUL:
+            few = np.ascontiguousarray(rows[:: max(1, len(rows) // 1000)])
+            short = max(1, round(lag * len(few) / len(rows)))
+            again = np.zeros(1, axisfit.WORK_DTYPE)
+            again[0]["axis"] = hint
+            hingefit.find_hand(again[0], few, len(few), short, p.sd_gyr, p.sd_acc, p.gravity)
+            w["hand"] = again[0]["hand"]
+        mirrored = handedness.left_handed_of(judged[0], (upper, lower), int(w["hand"]))
         sign = self.sign(upper, joint, best.axes[0], skew)
         best = best._replace(axes=sign * best.axes)
         sd = np.degrees(best.axes_sd)
         still = [n for n, r in zip((upper, lower), w["rate_rms"], strict=True) if r <= 0.05]
         why = ""
-        if still:
+        if mirrored:
+            why = mirrored_remark(mirrored).detail
+        elif still:
             why = f"{' and '.join(still)} never turns"
         elif w["turn_rms"] <= 0.1:
             why = f"both turn as one body ({w['turn_rms']:.2f} rad/s between them, at least 0.1)"
         elif sd.max() > p.max_sd_deg:
             why = f"standard deviation {sd.max():.1f}° above {p.max_sd_deg:g}°: more motion about other directions"
-        elif best.pairing <= 0.55:
+        elif best.pairing <= hingefit.PAIRED:
             why = f"the axes' signs cannot be paired ({best.pairing:.2f} of at least 0.55): axis near the vertical?"
         placed = best.position_sd < 0.05
         return {
@@ -216,6 +234,7 @@ class JointCalibrator(Calibrator):
             "pairing": best.pairing,
             "gyr_bias_rad_s": best.biases.tolist(),
             "acc_bias_m_s2": best.acc_biases.tolist(),
+            "biases_bounded": best.bounded,
             "mean_force_m_s2": [
                 rows[:, axisfit.ACC + b : axisfit.ACC + b + 3].mean(axis=0).tolist()
                 for b in (0, axisfit.WIDTH)

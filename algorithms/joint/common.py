@@ -10,7 +10,7 @@ import numpy as np
 
 from ..contract import ALL_COLUMNS, AlgorithmError, Context, FloatArray, Input, KernelEstimator, Remark
 from ..parameters import meta
-from . import merge
+from . import handedness, merge
 from .merge import ENCODER, JOINTS, SEGMENTS
 
 if TYPE_CHECKING:
@@ -140,6 +140,16 @@ def joint_name(upper: str, lower: str) -> str:
     return JOINTS[a] if b == a + 1 and a >= 0 else f"{upper}-{lower}"
 
 
+def mirrored_remark(segments: Sequence[str]) -> Remark:
+    """Return the remark of sensors whose gyroscope contradicts their accelerometer."""
+    return Remark(
+        "sensor_mirrored",
+        f"{' and '.join(segments)}: gravity turns against the gyroscope: left-handed axes (one axis mirrored) or the "
+        "wrong sign of the gyroscope; its angles would be wrong",
+        fatal=True,
+    )
+
+
 def side_of(context: Context, segments: Sequence[str]) -> str:
     """Return ``left_`` or ``right_`` where the channels are of one leg (``/leg/left_thigh/imu``), else empty."""
     topics = [c.topic for name in segments for c in context.channels.get(name, ())]
@@ -258,6 +268,21 @@ class JointEstimator(KernelEstimator):
                         fatal=True,
                     )
                 )
+            stuck = int(s["stuck"][i])
+            if stuck and s["dead"][i] == 0:
+                share = stuck / (stuck + int(s["count"][i]))
+                remarks.append(
+                    Remark(
+                        "sensor_stuck",
+                        f"{name}: {stuck} messages ({100 * share:.0f} %) repeat the one before exactly, for longer "
+                        "than a second: the sensor did not answer; they are left out",
+                        fatal=share > 0.1,
+                    )
+                )
+        hand = int(s["hand"]) if "hand" in (self.dtype.names or ()) else 0
+        mirrored = handedness.left_handed_of(s, self.segments, hand)
+        if mirrored:
+            remarks.append(mirrored_remark(mirrored))
         streams: Mapping[int, str] = {**dict(enumerate(self.segments)), ENCODER: "encoder"}
         for i, name in streams.items():
             missed = int(s["missed"][i])

@@ -18,6 +18,7 @@ from typing import Any
 
 from ..contract import FloatArray
 from ..numerics.compiled import compiled
+from . import handedness
 
 SEGMENTS = ("trunk", "thigh", "shank", "foot")
 JOINTS = ("hip", "knee", "ankle")
@@ -28,8 +29,10 @@ ENCODER = 4
 RING = 64
 LINE = 5
 MOST = 4
-NEVER = -(2**62)
 """Segments at most."""
+NEVER = -(2**62)
+STUCK_NS = 1_000_000_000
+"""No living sensor repeats force and rate to the last digit for so long: its noise moves them."""
 
 FIELDS: list[Any] = [
     ("n", "i8"),  # segments attached; they are numbered 0 … n − 1 from top to bottom
@@ -50,6 +53,8 @@ FIELDS: list[Any] = [
     ("seen", "i8", (MOST,)),  # time of the last valid sample of each segment
     ("missed", "i8", (STREAMS,)),
     ("dead", "i8", (MOST,)),  # samples in which acceleration and rate are exactly 0
+    ("stuck", "i8", (MOST,)),  # messages that were left out because they repeat the one before for too long
+    ("same_since", "i8", (MOST,)),
     ("samples", "i8"),
     ("given", "i8"),
     ("line_t", "i8", (LINE,)),
@@ -71,6 +76,7 @@ FIELDS: list[Any] = [
     ("gap", "f8", (MOST,)),  # seconds lost before this sample, 0 if none
     ("valid", "i8", (MOST,)),
     ("enc", "f8", (3,)),
+    *handedness.FIELDS,
 ]
 
 
@@ -80,6 +86,9 @@ def push(s: Any, index: int, t: int, values: FloatArray) -> None:
     i = s.stream[index]
     k = s.count[i]
     if k > 0 and t <= s.ring_t[i, (k - 1) % RING]:
+        return
+    s.newest = max(s.newest, t)
+    if i != ENCODER and repeats(s, i, t, values):
         return
     a = k % RING
     s.ring_t[i, a] = t
@@ -98,8 +107,24 @@ def push(s: Any, index: int, t: int, values: FloatArray) -> None:
                 s.ring[i, b, 6 + j] + 0.5 * dt * (s.ring[i, b, 3 + j] + values[3 + j]) if k > 0 else 0.0
             )
     s.count[i] = k + 1
-    if t > s.newest:
-        s.newest = t
+
+
+@compiled
+def repeats(s: Any, i: int, t: int, values: FloatArray) -> bool:
+    """Return whether sensor ``i`` has said exactly this for longer than STUCK_NS, and count such messages."""
+    same = s.count[i] > 0
+    if same:
+        b = (s.count[i] - 1) % RING
+        for j in range(6):
+            if s.ring[i, b, j] != values[j]:
+                same = False
+                break
+    if not same:
+        s.same_since[i] = t
+    stuck = t - s.same_since[i] > STUCK_NS
+    if stuck:
+        s.stuck[i] += 1
+    return stuck
 
 
 @compiled
@@ -208,6 +233,8 @@ def give(s: Any) -> bool:
                     s.dgyr[i, j] = (g2 - 8.0 * g1 + 8.0 * h1 - h2) / (3.0 * span)
                 else:
                     s.dgyr[i, j] = (3.0 * s.gyr[i, j] - 4.0 * g1 + g2) / span
+        if s.valid[i] == 1:
+            handedness.look(s, i)
     return True
 
 

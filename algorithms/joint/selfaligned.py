@@ -11,7 +11,7 @@ import math
 from typing import Any
 
 from ..numerics.compiled import compiled, inlined
-from . import axisfit, mounting
+from . import axisfit, hingefit, mounting
 
 STORE = 1024
 STILL_RATE = 0.05
@@ -86,23 +86,31 @@ def set_base(s: Any) -> None:
 
 
 @compiled
-def identify(s: Any, lag: int) -> None:
-    """Find the axes, and the position, from the store; judge them (see :func:`verdict`)."""
-    n = s.kept
+def reset_axes(s: Any) -> None:
+    """Begin with the axes of the parameters."""
     for i in range(2):
         for m in range(3):
             s.axis[i, m] = s.given_axis[i, m]
-    paired = axisfit.fit_axes(s, s.rows, n, lag, s.sd_gyr, s.sd_acc, s.gravity)
-    if s.learn == 2:
-        axisfit.fit_position(s, s.rows, n, 0.5)
-        paired = axisfit.fit_axes(s, s.rows, n, lag, s.sd_gyr, s.sd_acc, s.gravity)
-        axisfit.fit_position(s, s.rows, n, 0.5)
-        if s.pos_sd > 0.05:  # not observable: no lever rather than a wrong one
-            for i in range(2):
-                for m in range(3):
-                    s.pos[i, m] = 0.0
+
+
+@compiled
+def identify(s: Any, lag: int) -> None:
+    """Find the axes, and the position, from the store; judge them (see :func:`verdict`)."""
+    n = s.kept
+    reset_axes(s)
+    paired = hingefit.fit(s, s.rows, n, lag, s.sd_gyr, s.sd_acc, s.gravity, s.learn == 2)
+    s.hand = 0
+    if s.pairing < hingefit.DOUBTFUL:
+        reset_axes(s)
+        hingefit.find_hand(s, s.rows, n, lag, s.sd_gyr, s.sd_acc, s.gravity)
+        reset_axes(s)
+        paired = hingefit.fit(s, s.rows, n, lag, s.sd_gyr, s.sd_acc, s.gravity, s.learn == 2)
+    if s.learn == 2 and s.pos_sd > 0.05:  # not observable: no lever rather than a wrong one
+        for i in range(2):
+            for m in range(3):
+                s.pos[i, m] = 0.0
     s.fits += 1
-    if paired and observable(s):
+    if paired and s.hand == 0 and observable(s):
         s.known = 1
         mounting.orient(s, lag)
     else:
@@ -119,7 +127,7 @@ def identify(s: Any, lag: int) -> None:
 def observable(s: Any) -> bool:
     """Return whether the identified axes may be used."""
     moved = s.turn_rms > 0.1 and s.rate_rms[0] > 0.05 and s.rate_rms[1] > 0.05
-    return moved and s.axis_sd[0] < 0.05 and s.axis_sd[1] < 0.05 and s.pairing > 0.55
+    return moved and s.axis_sd[0] < 0.05 and s.axis_sd[1] < 0.05 and s.pairing > hingefit.PAIRED
 
 
 @inlined

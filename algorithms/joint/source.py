@@ -435,6 +435,8 @@ def axis_remarks(s: Any, segments: tuple[str, ...], fatal: bool = True) -> list[
             ),
             *mounting_remarks(s, segments),
         ]
+    if s["hand"]:  # said by JointEstimator.remarks
+        return []
     still = [n for n, rate in zip(segments, s["rate_rms"], strict=False) if rate <= 0.05]
     why = (
         f"{still[0]} never turns"
@@ -442,11 +444,7 @@ def axis_remarks(s: Any, segments: tuple[str, ...], fatal: bool = True) -> list[
         else f"both turn as one body (relative turn {s['turn_rms']:.2f} rad/s)"
         if s["turn_rms"] <= 0.1
         else f"sd {sd[0]:.1f}° and {sd[1]:.1f}°, pairing {s['pairing']:.2f} of at least 0.55"
-        + (
-            " (each axis is plain, their signs are not: one sensor mirrored, or axis near the vertical?)"
-            if max(sd) < 3.0
-            else ""
-        )
+        + (" (each axis is plain, their signs are not: axis near the vertical?)" if max(sd) < 3.0 else "")
     )
     return [
         Remark(

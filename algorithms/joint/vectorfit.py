@@ -25,8 +25,14 @@ from ..contract import FloatArray
 AXES, FIRST = slice(0, 4), 22
 """Places in the vector of unknowns: axes; gyroscope biases 4, accelerometer biases 10, positions 16; α_0 from here."""
 GYR, ACC, POS = 4, 10, 16
-SD_GYR_BIAS, SD_ACC_BIAS, SD_POSITION = 0.02, 0.1, 1.0
-"""Priors: what the data do not show stays at zero (rad/s, m/s², m)."""
+SD_GYR_BIAS, SD_ACC_BIAS, SD_POSITION = 0.01, 0.05, 1.0
+"""Priors: what the data do not show stays at zero (rad/s, m/s², m).
+
+Biases as the estimators have them (``sd_bias``, ``sd_acc_bias``). They are Gaussian: under Huber's loss, as that of the
+residuals, a knee's rotation with flexion became a bias of 12 °/s about both long axes, and tissue one of 2 m/s².
+"""
+PRIORS, MOST_SD = 18, 3.0
+"""Number of priors; a bias of more than so many of their standard deviations is none of a sensor's."""
 MOST_S = 60.0
 """Of longer data the liveliest part is taken: the rest adds time, not information."""
 RATE_HZ = 40.0
@@ -46,7 +52,8 @@ class Hinge(NamedTuple):
 
     ``axes``, ``positions`` (2, 3) in the sensors' frames, positions from the joint's centre to the sensor;
     ``axes_cov`` (2, 3, 3), ``axes_sd`` (2,) rad, ``position_sd`` m; ``pairing``: share of the worse pairing's cost in
-    both, 0.5 … 1; ``biases`` of gyroscopes (rad/s) and ``acc_biases`` (m/s²), (2, 3).
+    both, 0.5 … 1; ``biases`` of gyroscopes (rad/s) and ``acc_biases`` (m/s²), (2, 3); ``bounded``: whether one of them
+    is at the largest that a sensor has, so that something else looks like a bias (tissue, a joint that is no hinge).
     """
 
     axes: FloatArray
@@ -57,6 +64,7 @@ class Hinge(NamedTuple):
     pairing: float
     biases: FloatArray
     acc_biases: FloatArray
+    bounded: bool = False
 
 
 def basis(axis: FloatArray) -> FloatArray:
@@ -99,6 +107,15 @@ def thinned(spans: Sequence[Span]) -> list[Span]:
             t = t[::every]
         kept.append(Span(t, both[:, :6], both[:, 6:]))
     return kept
+
+
+def loss(z: FloatArray) -> FloatArray:
+    """Return Huber's loss of squared residuals with its derivatives (3, n), of the priors (the last) the square's."""
+    rho = np.stack([z, np.ones_like(z), np.zeros_like(z)])
+    far = np.flatnonzero(z[:-PRIORS] > 1.0)
+    root = np.sqrt(z[far])
+    rho[:, far] = 2.0 * root - 1.0, 1.0 / root, -0.5 / (root * z[far])
+    return rho
 
 
 class _Problem:
@@ -155,7 +172,7 @@ class _Problem:
         priors = [p[GYR:ACC] / SD_GYR_BIAS, p[ACC:POS] / SD_ACC_BIAS, p[POS:FIRST] / SD_POSITION]
         return np.concatenate([*out, *priors])
 
-    def solve(self, axes: FloatArray, most: int) -> tuple[float, list[FloatArray], FloatArray, FloatArray]:
+    def solve(self, axes: FloatArray, trials: int) -> tuple[float, list[FloatArray], FloatArray, FloatArray]:
         """Return cost, both bases, the unknowns and their covariance, from these axes on."""
         from scipy.optimize import least_squares
 
@@ -169,7 +186,11 @@ class _Problem:
                 costs.append(np.sum(np.minimum(self.misfit(p, bases) ** 2, 9.0)))
             p[FIRST + k] = grid[int(np.argmin(costs))]
         scale = np.r_[[0.05] * 4, [0.005] * 6, [0.05] * 6, [0.1] * 6, [0.1] * len(self.parts)]
-        solution = least_squares(self.misfit, p, args=(bases,), loss="huber", x_scale=scale, max_nfev=most)
+        most = np.full(len(p), np.inf)
+        most[GYR:ACC], most[ACC:POS] = MOST_SD * SD_GYR_BIAS, MOST_SD * SD_ACC_BIAS
+        solution = least_squares(
+            self.misfit, p, args=(bases,), loss=loss, bounds=(-most, most), x_scale=scale, max_nfev=trials
+        )
         normal = solution.jac.T @ solution.jac
         spread = max(1.0, 2.0 * float(solution.cost) / max(1, len(solution.fun)))
         cov = spread * np.linalg.pinv(normal)
@@ -214,4 +235,8 @@ def fit(spans: Sequence[Span], axes: FloatArray, band_hz: float, sd_gyr: float, 
         pairing=pairing,
         biases=p[GYR:ACC].reshape(2, 3),
         acc_biases=p[ACC:POS].reshape(2, 3),
+        bounded=bool(
+            np.abs(p[GYR:ACC]).max() > 0.99 * MOST_SD * SD_GYR_BIAS
+            or np.abs(p[ACC:POS]).max() > 0.99 * MOST_SD * SD_ACC_BIAS
+        ),
     )

@@ -1,0 +1,204 @@
+"""Whether a sensor's gyroscope and accelerometer agree which way it turns, from this sensor alone.
+
+With right-handed axes the force at a point whose vector to the sensor is o, turned by the integrated rate, is gravity
+and the point's acceleration: R (f − Γ(o)), dR/dt = R [g]×, stays near a constant over some seconds. In left-handed axes
+(one axis mirrored, or the gyroscope's sign wrong) that holds with −g in place of g, because a product of two vectors
+changes its sign under a reflection. Both are tried: over windows of :data:`WINDOW_S` the constant is the window's mean,
+o is found by least squares over all windows (a swinging lever may hide gravity's turn), and what is left is compared.
+
+Fast walking decides little (what is left is the body's acceleration either way), slow movements decide it by far; in
+doubt nothing is said. Where two sensors span a hinge, :func:`.hingefit.find_hand` compares them as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..contract import FloatArray
+from ..numerics.compiled import compiled
+from ..numerics.records import record_type
+from . import axisfit
+
+WINDOW_S = 2.0
+MOST_S = 60.0
+"""So much motion is looked at."""
+RATE = 0.22
+"""Root mean square of the rate (rad/s) that a window must have."""
+LEAST_WINDOWS = 3
+REACH = 0.3
+"""Prior of the lever (m)."""
+LEAST_RMS = 0.7
+"""What is left (m/s²) below which either is good enough: hardly any motion."""
+BETTER = 0.6
+"""Left with the rate reversed, over left with it as it is, below which the axes are called left-handed."""
+
+FIELDS: list[Any] = [
+    ("hand_rot", "f8", (4, 2, 3, 3)),
+    ("hand_time", "f8", (4,)),  # of the present window
+    ("hand_count", "i8", (4,)),
+    ("hand_rate", "f8", (4,)),
+    ("hand_force", "f8", (4, 2, 3)),  # sums of the window: R f, R G, fᵀf, Gᵀf, GᵀG
+    ("hand_lever", "f8", (4, 2, 3, 3)),
+    ("hand_ff", "f8", (4,)),
+    ("hand_gf", "f8", (4, 2, 3)),
+    ("hand_gg", "f8", (4, 2, 3, 3)),
+    ("hand_N", "f8", (4, 2, 3, 3)),  # of all windows, their means taken out
+    ("hand_b", "f8", (4, 2, 3)),
+    ("hand_yy", "f8", (4, 2)),
+    ("hand_samples", "i8", (4,)),
+    ("hand_windows", "i8", (4,)),
+]
+"""Fields of a packed record, four sensors, rate as it is and reversed."""
+
+
+PAIR = record_type(
+    ("acc", "f8", (2, 3)),
+    ("gyr", "f8", (2, 3)),
+    ("dgyr", "f8", (2, 3)),
+    ("turn", "f8", (2, 3)),
+    ("dt", "f8"),
+    ("slope", "i8", (2,)),
+    ("gap", "f8", (2,)),
+    *FIELDS,
+)
+
+
+@compiled
+def begin(s: Any, i: int) -> None:
+    """Begin a window of sensor ``i``."""
+    s.hand_time[i], s.hand_rate[i], s.hand_ff[i] = 0.0, 0.0, 0.0
+    s.hand_count[i] = 0
+    for h in range(2):
+        for a in range(3):
+            s.hand_force[i, h, a], s.hand_gf[i, h, a] = 0.0, 0.0
+            for b in range(3):
+                s.hand_rot[i, h, a, b] = 1.0 if a == b else 0.0
+                s.hand_lever[i, h, a, b], s.hand_gg[i, h, a, b] = 0.0, 0.0
+
+
+@compiled
+def close(s: Any, i: int) -> None:
+    """Add a whole window of sensor ``i`` to all, if it turned."""
+    n = s.hand_count[i]
+    if n < 10 or s.hand_rate[i] < RATE * RATE * n:
+        return
+    for h in range(2):
+        yy = s.hand_ff[i]
+        for a in range(3):
+            yy -= s.hand_force[i, h, a] ** 2 / n
+            mean = 0.0
+            for k in range(3):
+                mean += s.hand_lever[i, h, k, a] * s.hand_force[i, h, k]
+            s.hand_b[i, h, a] += s.hand_gf[i, h, a] - mean / n
+            for b in range(3):
+                mean = 0.0
+                for k in range(3):
+                    mean += s.hand_lever[i, h, k, a] * s.hand_lever[i, h, k, b]
+                s.hand_N[i, h, a, b] += s.hand_gg[i, h, a, b] - mean / n
+        s.hand_yy[i, h] += yy
+    s.hand_samples[i] += n
+    s.hand_windows[i] += 1
+
+
+@compiled
+def look(s: Any, i: int) -> None:
+    """Take sensor ``i`` of the sample given out (``acc``, ``gyr``, ``dgyr``, ``turn``, ``dt`` of ``s``)."""
+    if s.hand_windows[i] * WINDOW_S >= MOST_S:
+        return
+    if s.slope[i] == 0 or s.gap[i] > 0.0:
+        begin(s, i)
+        return
+    if s.hand_time[i] >= WINDOW_S or s.hand_count[i] == 0:
+        close(s, i)
+        begin(s, i)
+    s.hand_time[i] += s.dt
+    s.hand_count[i] += 1
+    f, g, d = s.acc[i], s.gyr[i], s.dgyr[i]
+    s.hand_rate[i] += g[0] * g[0] + g[1] * g[1] + g[2] * g[2]
+    s.hand_ff[i] += f[0] * f[0] + f[1] * f[1] + f[2] * f[2]
+    for h in range(2):
+        sign = 1.0 if h == 0 else -1.0
+        r = s.hand_rot[i, h]
+        if s.hand_count[i] > 1:
+            # exp of the turn to second order, then Gram-Schmidt: exact enough over two seconds
+            x, y, z = sign * s.turn[i, 0], sign * s.turn[i, 1], sign * s.turn[i, 2]
+            for k in range(3):
+                p, q, w = r[k, 0], r[k, 1], r[k, 2]
+                dot = p * x + q * y + w * z
+                size = x * x + y * y + z * z
+                r[k, 0] = p + q * z - w * y + 0.5 * (dot * x - size * p)
+                r[k, 1] = q + w * x - p * z + 0.5 * (dot * y - size * q)
+                r[k, 2] = w + p * y - q * x + 0.5 * (dot * z - size * w)
+                norm = (r[k, 0] ** 2 + r[k, 1] ** 2 + r[k, 2] ** 2) ** 0.5
+                for m in range(3):
+                    r[k, m] /= norm
+        for a in range(3):
+            # Column a of Γ: g g_a − |g|² e_a + sign · ġ × e_a.
+            size = g[0] * g[0] + g[1] * g[1] + g[2] * g[2]
+            c0, c1, c2 = g[0] * g[a], g[1] * g[a], g[2] * g[a]
+            if a == 0:
+                c0, c1, c2 = c0 - size, c1 + sign * d[2], c2 - sign * d[1]
+            elif a == 1:
+                c0, c1, c2 = c0 - sign * d[2], c1 - size, c2 + sign * d[0]
+            else:
+                c0, c1, c2 = c0 + sign * d[1], c1 - sign * d[0], c2 - size
+            s.hand_gf[i, h, a] += c0 * f[0] + c1 * f[1] + c2 * f[2]
+            for b in range(3):
+                # Gᵀ G is symmetric in a, b: entries of column b again.
+                e0, e1, e2 = g[0] * g[b], g[1] * g[b], g[2] * g[b]
+                if b == 0:
+                    e0, e1, e2 = e0 - size, e1 + sign * d[2], e2 - sign * d[1]
+                elif b == 1:
+                    e0, e1, e2 = e0 - sign * d[2], e1 - size, e2 + sign * d[0]
+                else:
+                    e0, e1, e2 = e0 + sign * d[1], e1 - sign * d[0], e2 - size
+                s.hand_gg[i, h, a, b] += c0 * e0 + c1 * e1 + c2 * e2
+            for k in range(3):
+                s.hand_lever[i, h, k, a] += r[k, 0] * c0 + r[k, 1] * c1 + r[k, 2] * c2
+        for k in range(3):
+            s.hand_force[i, h, k] += r[k, 0] * f[0] + r[k, 1] * f[1] + r[k, 2] * f[2]
+
+
+@compiled
+def look_through(s: Any, rows: FloatArray, dt: float) -> None:
+    """Take all samples of two sensors, columns of :mod:`.axisfit`, ``dt`` apart."""
+    s.dt = dt
+    for k in range(1, rows.shape[0]):
+        for i in range(2):
+            b = axisfit.WIDTH * i
+            for m in range(3):
+                s.acc[i, m] = rows[k, b + axisfit.ACC + m]
+                s.gyr[i, m] = rows[k, b + axisfit.GYR + m]
+                s.dgyr[i, m] = rows[k, b + axisfit.DGYR + m]
+                s.turn[i, m] = rows[k, b + axisfit.SUM + m] - rows[k - 1, b + axisfit.SUM + m]
+            s.slope[i] = 1
+            look(s, i)
+
+
+def left_over(s: Any, i: int) -> tuple[float, float]:
+    """Return what is left (m/s²) of sensor ``i`` with its rate as it is, and reversed; NaN without enough motion."""
+    if s["hand_windows"][i] < LEAST_WINDOWS:
+        return float("nan"), float("nan")
+    count = 3.0 * float(s["hand_samples"][i])
+    left = []
+    for h in range(2):
+        N, b, yy = s["hand_N"][i, h], s["hand_b"][i, h], float(s["hand_yy"][i, h])
+        prior = float(s["hand_windows"][i]) * 5.0 * yy / count / REACH**2
+        o = np.linalg.solve(N + prior * np.eye(3), b)
+        left.append(float(np.sqrt(max(0.0, yy - 2.0 * b @ o + o @ N @ o) / count)))
+    return left[0], left[1]
+
+
+def left_handed(s: Any, i: int) -> bool:
+    """Return whether the axes of sensor ``i`` are left-handed, or its gyroscope's sign wrong."""
+    plain, reversed_rate = left_over(s, i)
+    return plain > LEAST_RMS and reversed_rate < BETTER * plain
+
+
+def left_handed_of(s: Any, segments: Sequence[str], hand: int) -> list[str]:
+    """Return the segments whose sensors are left-handed, by themselves, else by the pair (``hand``, a bit each)."""
+    alone = [name for i, name in enumerate(segments) if left_handed(s, i)]
+    return alone or [name for i, name in enumerate(segments) if hand >> i & 1]
