@@ -25,7 +25,7 @@ from .common import (
     vector,
 )
 from .merge import SEGMENTS
-from .mounting import GUESS_DEG, NEAR, SKEWED, long_axes, skewness
+from .mounting import GUESS_DEG, NEAR, SKEWED, long_axis, skewness
 
 MOST_ROWS = 20_000
 
@@ -280,8 +280,11 @@ class JointCalibrator(Calibrator):
             if not hinge["usable"]:
                 continue
             pair = hinge["segments"]
-            mountings = np.array([given_mount(self.params, s) for s in pair])
-            up, guessed = long_axes(np.array(hinge["axes"]), mountings, np.array(hinge["mean_force_m_s2"]))
+            up = np.zeros((2, 3))
+            guessed = [
+                bool(long_axis(np.array(a), given_mount(self.params, s)[[0, 2]], np.array(f), u))
+                for s, a, f, u in zip(pair, hinge["axes"], hinge["mean_force_m_s2"], up, strict=True)
+            ]
             hinge["long_axes_guessed"] = [g and s not in stood for g, s in zip(guessed, pair, strict=True)]
             for segment, one, guess in zip(pair, up, guessed, strict=True):
                 if segment not in long or hinge["joint"] == "knee":

@@ -32,6 +32,8 @@ from .selfaligned import near
 
 HINGE, TWO, FREE = 0, 1, 2
 GUESS = math.radians(GUESS_DEG)
+FIRST_MISFITS, MISFITS = 300, 10_000
+"""Innovations of the connection that the parameters are worth at the start, and over how many the mean runs."""
 MOST = merge.MOST
 STATES = 6 * MOST
 JOINTS = MOST - 1
@@ -90,7 +92,13 @@ DTYPE = np.dtype(
         ("rot_before", "f8", (MOST, 3, 3)),
         ("bias_before", "f8", (MOST, 3)),
         ("P_before", "f8", (STATES, STATES)),
-        ("misfit", "f8"),  # of the connection, running mean square over its variance
+        ("two_tau", "f8"),  # 2 τ of the connection's misfit
+        (
+            "misfit",
+            "f8",
+            (JOINTS,),
+        ),  # running mean square of the connection's innovation over what sd_joint says
+        ("misfits", "i8", (JOINTS,)),
     ]
 )
 
@@ -300,7 +308,8 @@ def connect(s: Any, j: int) -> None:
             cross_row(s, 0, j, s.u, k, 1.0)
             cross_row(s, 3, j + 1, s.v, k, -1.0)
             e = s.v[k] - s.u[k]
-            s.misfit += 0.001 * (e * e / r - s.misfit)
+            s.misfits[j] = min(MISFITS, s.misfits[j] + 1)
+            s.misfit[j] += (s.two_tau * e * e / (r * max(1e-4, s.dt)) - s.misfit[j]) / s.misfits[j]
             take(s, 6, e, r)
     r = s.r_sway / max(1e-4, s.dt)
     if s.type[j] == FREE:
@@ -414,8 +423,18 @@ def set_zero(s: Any) -> None:
 @compiled
 def stated_sd(s: Any, j: int) -> float:
     """Return the standard deviation of flexion ``j`` with what does not change with time: zero and accelerometers."""
-    zero = s.mount_var if s.zero == 0 or s.zero_count[j] == 0 else s.zero_var[j] / s.zero_count[j]
-    return math.sqrt(s.angle_sd[j] ** 2 + zero + s.tilt_var)
+    scale = innovation_scale(s, j)
+    zero = s.mount_var if s.zero == 0 or s.zero_count[j] == 0 else scale * s.zero_var[j] / s.zero_count[j]
+    return math.sqrt(scale * s.angle_sd[j] ** 2 + zero + s.tilt_var)
+
+
+@compiled
+def innovation_scale(s: Any, j: int) -> float:
+    """Return by what the filter's variance of joint ``j`` is multiplied: innovations as they are over as assumed.
+
+    A rigid chain fits better than ``sd_joint`` says, a leg with soft tissue worse (0.1 to 0.5, and 4 to 5).
+    """
+    return min(10.0, max(0.1, s.misfit[j]))
 
 
 @compiled

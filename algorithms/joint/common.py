@@ -270,13 +270,19 @@ class JointEstimator(KernelEstimator):
                 )
             stuck = int(s["stuck"][i])
             if stuck and s["dead"][i] == 0:
-                share = stuck / (stuck + int(s["count"][i]))
+                share = stuck / int(s["count"][i])
+                moving = int(s["stuck_moving"][i]) / int(s["count"][i])
                 remarks.append(
                     Remark(
                         "sensor_stuck",
                         f"{name}: {stuck} messages ({100 * share:.0f} %) repeat the one before exactly, for longer "
-                        "than a second: the sensor did not answer; they are left out",
-                        fatal=share > 0.1,
+                        "than a second: the sensor did not answer, "
+                        + (
+                            "and the angles there are wrong"
+                            if moving
+                            else "or its filter hides that it rests"
+                        ),
+                        fatal=moving > 0.1,
                     )
                 )
         hand = int(s["hand"]) if "hand" in (self.dtype.names or ()) else 0

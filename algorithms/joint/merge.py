@@ -33,6 +33,8 @@ MOST = 4
 NEVER = -(2**62)
 STUCK_NS = 1_000_000_000
 """No living sensor repeats force and rate to the last digit for so long: its noise moves them."""
+REST_RATE, REST_FORCE = 0.2, 1.0
+"""Rate (rad/s, with a consumer's bias) and force besides gravity (m/s²) of a sensor that may as well be at rest."""
 
 FIELDS: list[Any] = [
     ("n", "i8"),  # segments attached; they are numbered 0 … n − 1 from top to bottom
@@ -53,7 +55,8 @@ FIELDS: list[Any] = [
     ("seen", "i8", (MOST,)),  # time of the last valid sample of each segment
     ("missed", "i8", (STREAMS,)),
     ("dead", "i8", (MOST,)),  # samples in which acceleration and rate are exactly 0
-    ("stuck", "i8", (MOST,)),  # messages that were left out because they repeat the one before for too long
+    ("stuck", "i8", (MOST,)),  # messages that repeat the one before for too long
+    ("stuck_moving", "i8", (MOST,)),  # those of them that are no reading of a sensor at rest
     ("same_since", "i8", (MOST,)),
     ("samples", "i8"),
     ("given", "i8"),
@@ -88,8 +91,8 @@ def push(s: Any, index: int, t: int, values: FloatArray) -> None:
     if k > 0 and t <= s.ring_t[i, (k - 1) % RING]:
         return
     s.newest = max(s.newest, t)
-    if i != ENCODER and repeats(s, i, t, values):
-        return
+    if i != ENCODER:
+        count_repeats(s, i, t, values)
     a = k % RING
     s.ring_t[i, a] = t
     if i == ENCODER:
@@ -110,8 +113,8 @@ def push(s: Any, index: int, t: int, values: FloatArray) -> None:
 
 
 @compiled
-def repeats(s: Any, i: int, t: int, values: FloatArray) -> bool:
-    """Return whether sensor ``i`` has said exactly this for longer than STUCK_NS, and count such messages."""
+def count_repeats(s: Any, i: int, t: int, values: FloatArray) -> None:
+    """Count the message of sensor ``i`` as stuck if it has said exactly this for longer than STUCK_NS."""
     same = s.count[i] > 0
     if same:
         b = (s.count[i] - 1) % RING
@@ -121,10 +124,12 @@ def repeats(s: Any, i: int, t: int, values: FloatArray) -> bool:
                 break
     if not same:
         s.same_since[i] = t
-    stuck = t - s.same_since[i] > STUCK_NS
-    if stuck:
+    elif t - s.same_since[i] > STUCK_NS:
         s.stuck[i] += 1
-    return stuck
+        force = (values[0] ** 2 + values[1] ** 2 + values[2] ** 2) ** 0.5
+        rate = (values[3] ** 2 + values[4] ** 2 + values[5] ** 2) ** 0.5
+        if rate > REST_RATE or abs(force - 9.81) > REST_FORCE:
+            s.stuck_moving[i] += 1
 
 
 @compiled

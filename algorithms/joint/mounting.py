@@ -19,30 +19,43 @@ GUESS_DEG = 30.0
 """How well the mean direction of gravity stands for a segment's long axis, standing or walking."""
 
 
-def long_axes(axes: FloatArray, mountings: FloatArray, forces: FloatArray) -> tuple[FloatArray, list[bool]]:
-    """Return the long axes (2, 3), upwards, in the frames of both sensors of a joint, and which of them are guessed.
+@compiled
+def long_axis(axis: FloatArray, mounting: FloatArray, force: FloatArray, up: FloatArray) -> bool:
+    """Write a sensor's long axis, upwards, to ``up``; return whether it is guessed.
 
-    Where a found axis lies far off the parameter's, this says nothing of the sensor: the mean force does, as if
-    the segment were upright on average.
+    Where the axis that was found lies far off the parameter's, this says nothing of the sensor: the mean force does, as
+    if the segment were upright on average.
 
     Parameters
     ----------
-    axes : ndarray, shape (2, 3)
-        Flexion axes that were found.
-    mountings : ndarray, shape (2, 3, 3)
-        As the parameters say: rows x flexion axis, y, z long axis.
-    forces : ndarray, shape (2, 3)
-        Mean specific force of each sensor.
+    axis : ndarray, shape (3,)
+        Flexion axis that was found.
+    mounting : ndarray, shape (2, 3)
+        As the parameters say: flexion axis and long axis.
+    force : ndarray, shape (3,)
+        Mean specific force of the sensor.
+    up : ndarray, shape (3,)
+        Written.
     """
-    up, guessed = mountings[:, 2].copy(), [False, False]
-    for i in range(2):
-        if abs(axes[i] @ mountings[i, 0]) >= NEAR:
-            continue
-        guessed[i] = True
-        across = forces[i] - (forces[i] @ axes[i]) * axes[i]
-        up[i] = across if np.linalg.norm(across) > 1.0 else np.eye(3)[int(np.argmin(np.abs(axes[i])))]
-        up[i] /= np.linalg.norm(up[i])
-    return up, guessed
+    cosine, along, size = 0.0, 0.0, 0.0
+    for m in range(3):
+        cosine += axis[m] * mounting[0, m]
+        along += force[m] * axis[m]
+    guessed = abs(cosine) < NEAR
+    least = 0
+    for m in range(3):
+        up[m] = force[m] - along * axis[m]
+        size += up[m] ** 2
+        if abs(axis[m]) < abs(axis[least]):
+            least = m
+    for m in range(3):
+        if not guessed:
+            up[m] = mounting[1, m]
+        elif size > 1.0:
+            up[m] /= math.sqrt(size)
+        else:
+            up[m] = 1.0 if m == least else 0.0
+    return guessed
 
 
 @inlined
@@ -79,7 +92,7 @@ def skewness(w: Any, rows: FloatArray, count: int, lag: int) -> float:
 
 @compiled
 def orient(s: Any, lag: int) -> None:
-    """Set the long axes ``s.up`` (as :func:`long_axes`), and the sign of axes that lie far off the given one."""
+    """Set the long axes ``s.up`` (:func:`long_axis`), and the sign of axes that lie far off the given one."""
     s.skew = skewness(s, s.rows, s.kept, lag)
     far = 0.0
     for m in range(3):
@@ -90,27 +103,12 @@ def orient(s: Any, lag: int) -> None:
             for m in range(3):
                 s.axis[i, m] = -s.axis[i, m]
     for i in range(2):
-        cosine, along, size = 0.0, 0.0, 0.0
         for m in range(3):
-            cosine += s.axis[i, m] * s.given_axis[i, m]
-            s.up[i, m] = 0.0
+            s.given_pair[0, m], s.given_pair[1, m] = s.given_axis[i, m], s.given_up[i, m]
+            s.mean_force[m] = 0.0
             for k in range(s.kept):
-                s.up[i, m] += s.rows[k, axisfit.WIDTH * i + axisfit.ACC + m] / s.kept
-            along += s.up[i, m] * s.axis[i, m]
-        s.guessed[i] = 1 if abs(cosine) < NEAR else 0
-        least = 0
-        for m in range(3):
-            s.up[i, m] -= along * s.axis[i, m]
-            size += s.up[i, m] ** 2
-            if abs(s.axis[i, m]) < abs(s.axis[i, least]):
-                least = m
-        for m in range(3):
-            if s.guessed[i] == 0:
-                s.up[i, m] = s.given_up[i, m]
-            elif size > 1.0:
-                s.up[i, m] /= math.sqrt(size)
-            else:
-                s.up[i, m] = 1.0 if m == least else 0.0
+                s.mean_force[m] += s.rows[k, axisfit.WIDTH * i + axisfit.ACC + m] / s.kept
+        s.guessed[i] = 1 if long_axis(s.axis[i], s.given_pair, s.mean_force, s.up[i]) else 0
 
 
 def mounting_remarks(s: Any, segments: tuple[str, ...]) -> list[Remark]:

@@ -147,6 +147,8 @@ class ChainEstimator(JointEstimator):
         s["k_force"] = 2.0 * p.grow_force**2 * p.tau_force
         s["r_joint"] = 2.0 * p.sd_joint**2 * p.tau_joint
         s["k_joint"] = 2.0 * p.grow_joint**2 * p.tau_joint
+        s["two_tau"] = 2.0 * p.tau_joint
+        s["misfit"], s["misfits"] = 1.0, chain.FIRST_MISFITS
         s["r_sway"] = 2.0 * np.radians(p.sway_deg) ** 2 * p.tau_sway
         s["r_rest"] = 2.0 * p.sd_rest**2 * 0.5
         s["learn"], s["known"] = 0, 1

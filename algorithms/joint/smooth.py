@@ -12,7 +12,7 @@ import polars as pl
 from ..calibration import Calibration, Stretch
 from ..contract import AlgorithmError, Context, FloatArray, IntArray, Output, Remark
 from ..parameters import meta
-from . import chain_smooth
+from . import chain, chain_smooth
 from .calibrate import JointCalibrationParams, JointCalibrator
 from .common import IMU_COLUMNS
 from .mounting import mounting_remarks
@@ -26,6 +26,15 @@ SEGMENT = 2048
 class SmoothParams(HingeParams, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Of ``joint.hinge``; ``identify`` is over the whole recording, as calibration ``joint`` does it."""
 
+    grow_gyr: Annotated[
+        float,
+        meta(
+            "Growth of the gyroscope's noise with the rate; less than online, for the future takes drift out too",
+            "1/√Hz",
+            "ours",
+            ge=0.0,
+        ),
+    ] = 0.002
     band_hz: Annotated[
         float, meta("Identification: misfits are low-passed here", "Hz", "ours", ge=0.0, le=20.0)
     ] = 1.5
@@ -178,6 +187,7 @@ class JointSmooth(ChainEstimator):
         angles[:, 0] = np.unwrap(angles[:, 0])
         spread = float(s["mount_var"])
         off = 0.0
+        angles[:, 1] *= np.sqrt(chain.innovation_scale(s, 0))
         if s["zero"]:
             early = t_ns <= t_ns[0] + round(p.zero_s * 1e9)
             apart = angles[:, 0] - (encoder if p.zero == "encoder" else 0.0)

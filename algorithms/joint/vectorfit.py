@@ -188,8 +188,9 @@ class _Problem:
         scale = np.r_[[0.05] * 4, [0.005] * 6, [0.05] * 6, [0.1] * 6, [0.1] * len(self.parts)]
         most = np.full(len(p), np.inf)
         most[GYR:ACC], most[ACC:POS] = MOST_SD * SD_GYR_BIAS, MOST_SD * SD_ACC_BIAS
+        rho: Any = loss  # the stubs of scipy know names only
         solution = least_squares(
-            self.misfit, p, args=(bases,), loss=loss, bounds=(-most, most), x_scale=scale, max_nfev=trials
+            self.misfit, p, args=(bases,), loss=rho, bounds=(-most, most), x_scale=scale, max_nfev=trials
         )
         normal = solution.jac.T @ solution.jac
         spread = max(1.0, 2.0 * float(solution.cost) / max(1, len(solution.fun)))
