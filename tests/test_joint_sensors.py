@@ -105,7 +105,7 @@ def test_what_is_left_of_a_turning_sensor_is_its_noise() -> None:
     assert [handedness.left_handed(s[0], i) for i in range(2)] == [False, True]
 
 
-def test_a_stuck_sensor_is_left_out_and_fatal() -> None:
+def test_a_stuck_sensor_is_said_and_fatal() -> None:
     """From 8 s on the shank repeats its last reading; a pause of half a second is nothing to say."""
     tables = captured("walking", seed=3)
     ((topic, one),) = tables["shank"].items()

@@ -50,7 +50,7 @@ def test_knowing_the_future_makes_it_better(runs: list[tuple[dict[str, Run], pl.
     assert make("joint.smooth").offline
     for pair, _ in runs:
         causal, smoothed = (pair[n].metrics for n in ("joint.hinge", "joint.smooth"))
-        assert smoothed["rmse_unbiased_deg.knee"] < 0.9 * causal["rmse_unbiased_deg.knee"]
+        assert smoothed["rmse_unbiased_deg.knee"] < 0.5 * causal["rmse_unbiased_deg.knee"]
         assert smoothed["rmse_deg.knee"] < 1.2  # the accelerometers' constant error is in it
 
 
@@ -168,9 +168,9 @@ def test_wobble_of_the_joint_does_not_turn_the_angle_away() -> None:
 @pytest.mark.data
 @pytest.mark.parametrize(("upper", "axis", "limit"), [(2, "x", 0.5), (3, "y", 0.3), (4, "z", 0.3)])
 def test_chain_with_cameras(data_dir: Path, upper: int, axis: str, limit: float) -> None:
-    """Without bias better than online, and inside its stated 95 %; joint 2-3 wobbles by 3° about its hinge."""
+    """Better than online, bias included, and inside its stated 95 %; joint 2-3 wobbles by 3° about its hinge."""
     figures = against_cameras("joint.smooth", data_dir, upper, axis)
-    assert figures["rmse_unbiased_deg"] < limit
+    assert figures["rmse_deg"] < limit
     assert figures["within95_percent"] > 90.0
 
 

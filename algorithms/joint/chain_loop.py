@@ -8,7 +8,8 @@ from typing import Any
 from ..contract import FloatArray, IntArray
 from ..numerics.compiled import compiled
 from . import merge
-from .chain import FREE, HINGE, measure_angles, set_zero, stated_sd, step
+from .chain import FREE, HINGE, measure_angles, step
+from .chain_zero import set_zero, stated_sd
 
 
 @compiled

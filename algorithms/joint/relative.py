@@ -9,6 +9,7 @@ import numpy as np
 from ..contract import AlgorithmError, Context, FloatArray, Input, Output, Remark
 from ..parameters import meta
 from . import chain, chain_loop
+from .chain_zero import spread_of_zero
 from .common import JointEstimator, MergeParams, encoder, imu, mounts
 from .source import JOINT_STATE, NAMED, axis_remarks, set_up_axes
 
@@ -211,7 +212,7 @@ class JointHinge(ChainEstimator):
         s["j"][0] = s["axis"]
         s["lever"][0] = s["pos"]
         s["placed"][0] = bool(np.any(s["pos"]))
-        chain.spread_of_zero(s)
+        spread_of_zero(s)
 
     def remarks(self) -> list[Remark]:
         """Say whether the axes are known."""

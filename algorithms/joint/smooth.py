@@ -12,8 +12,9 @@ import polars as pl
 from ..calibration import Calibration, Stretch
 from ..contract import AlgorithmError, Context, FloatArray, IntArray, Output, Remark
 from ..parameters import meta
-from . import chain, chain_smooth
+from . import chain_smooth
 from .calibrate import JointCalibrationParams, JointCalibrator
+from .chain_zero import innovation_scale
 from .common import IMU_COLUMNS
 from .mounting import mounting_remarks
 from .relative import ChainEstimator, HingeParams, JointHinge
@@ -187,7 +188,7 @@ class JointSmooth(ChainEstimator):
         angles[:, 0] = np.unwrap(angles[:, 0])
         spread = float(s["mount_var"])
         off = 0.0
-        angles[:, 1] *= np.sqrt(chain.innovation_scale(s, 0))
+        angles[:, 1] *= np.sqrt(innovation_scale(s, 0))
         if s["zero"]:
             early = t_ns <= t_ns[0] + round(p.zero_s * 1e9)
             apart = angles[:, 0] - (encoder if p.zero == "encoder" else 0.0)
