@@ -35,7 +35,7 @@ def turn_to_sensor(rate: FloatArray, seen: FloatArray) -> Rotation:
 
 @pytest.mark.data
 def test_inclination_of_three_segments_beside_cameras(data_dir: Path, tmp_path: Path) -> None:
-    """The third misses the promised 5°, but not where the cameras' orientation is steady (docs/joints.md)."""
+    """The second misses the promised 1.3°; the third is best where the cameras' orientation is steady (docs/joints.md)."""
     files = sorted((data_dir / "leg" / "pendulum_optical").glob("*.csv"))
     convert(files, tmp_path / "pendulum.mcap", options={"segments": ",".join(SEGMENTS)})
     rec = mr.open(tmp_path / "pendulum.mcap")
@@ -69,6 +69,6 @@ def test_inclination_of_three_segments_beside_cameras(data_dir: Path, tmp_path: 
         whole.append(np.sqrt(np.mean(error[s > 1.2] ** 2)))
         steady.append(np.sqrt(np.mean(error[(s > 1.2) & ~near] ** 2)))
     assert whole[0] < 1.1
-    assert whole[1] < 1.8
-    assert whole[2] < 7.0
-    assert steady[2] < 3.0
+    assert whole[1] < 1.6
+    assert whole[2] < 5.5
+    assert steady[2] < 2.5
