@@ -35,7 +35,7 @@ def turn_to_sensor(rate: FloatArray, seen: FloatArray) -> Rotation:
 
 @pytest.mark.data
 def test_inclination_of_three_segments_beside_cameras(data_dir: Path, tmp_path: Path) -> None:
-    """The second misses the promised 1.3°; the third is best where the cameras' orientation is steady (docs/joints.md)."""
+    """The second misses the promised 1.3°; the third is best where the cameras are steady (docs/joints.md)."""
     files = sorted((data_dir / "leg" / "pendulum_optical").glob("*.csv"))
     convert(files, tmp_path / "pendulum.mcap", options={"segments": ",".join(SEGMENTS)})
     rec = mr.open(tmp_path / "pendulum.mcap")

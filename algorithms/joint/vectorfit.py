@@ -28,7 +28,8 @@ GYR, ACC, POS = 4, 10, 16
 SD_GYR_BIAS, SD_ACC_BIAS, SD_POSITION = 0.02, 0.1, 1.0
 """Priors: what the data do not show stays at zero (rad/s, m/s², m).
 
-Those of biases are Gaussian: under Huber's loss, as that of the residuals, a knee's rotation with flexion became a bias of 12 °/s about both long axes, and tissue one of 2 m/s².
+Those of biases are Gaussian: under Huber's loss, as that of the residuals, a knee's rotation with flexion became a bias
+of 12 °/s about both long axes, and tissue one of 2 m/s².
 """
 PRIORS, MOST_SD = 18, 3.0
 """Number of priors; a bias of more than so many of their standard deviations is none of a sensor's."""
