@@ -15,6 +15,7 @@ from .console import (
     complain,
 )
 from .contents import say_losses
+from .errors import DONE, INTERRUPTED
 from .options import (
     DEFAULT,
     QUIET,
@@ -83,7 +84,7 @@ def by_eye(
         complain(f"took up {session.taken_up} edits of an earlier session from {session.draft}")
     try:
         if page:
-            annotate_page(
+            interrupted = annotate_page(
                 session,
                 video=video,
                 video_offset_s=video_offset,
@@ -91,7 +92,7 @@ def by_eye(
                 opened=lambda server: complain(f"the page is at {server.address}; Ctrl-C ends it"),
             )
         else:
-            annotate_in_viewer(
+            interrupted = annotate_in_viewer(
                 session,
                 say=complain,
                 opened=lambda window: complain(f"the viewer is at {window.address}"),
@@ -101,7 +102,8 @@ def by_eye(
         if left:
             complain(f"{left} annotations are not saved; {session.draft} keeps them for the next session")
     document = {"output": str(session.out), "annotations": len(session.rows), "unsaved": left}
-    return Outcome(document, [Heading(f"{session.out}: {len(session.rows)} annotations, {left} not saved")])
+    summary = Heading(f"{session.out}: {len(session.rows)} annotations, {left} not saved")
+    return Outcome(document, [summary], code=INTERRUPTED if interrupted else DONE)
 
 
 @app.command

@@ -18,7 +18,7 @@ def annotate_page(
     video_offset_s: float = 0.0,
     open_browser: bool = True,
     opened: Callable[[PageServer], object] | None = None,
-) -> None:
+) -> bool:
     """Serve the page for a session until the program is interrupted.
 
     Parameters
@@ -33,6 +33,11 @@ def annotate_page(
         Whether to open a browser window.
     opened : callable, optional
         Called with the server once it runs, for example to print its address.
+
+    Returns
+    -------
+    bool
+        Whether Ctrl-C ended it; SIGTERM is raised.
 
     Raises
     ------
@@ -49,3 +54,5 @@ def annotate_page(
         except KeyboardInterrupt as ending:
             if type(ending) is not KeyboardInterrupt:  # Ctrl-C ends a session, SIGTERM the program
                 raise
+            return True
+    return False

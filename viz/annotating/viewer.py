@@ -227,7 +227,7 @@ def annotate_in_viewer(
     online: bool = False,
     say: Callable[[str], object] = print,
     opened: Callable[[Viewer], object] | None = None,
-) -> None:
+) -> bool:
     """Open the native viewer and mark in it until its window is closed or ``q`` is pressed.
 
     Parameters
@@ -240,6 +240,11 @@ def annotate_in_viewer(
         Is given every line for the user.
     opened : callable, optional
         Called with the viewer once it shows the recording.
+
+    Returns
+    -------
+    bool
+        Whether Ctrl-C ended it; SIGTERM is raised.
 
     Raises
     ------
@@ -262,12 +267,14 @@ def annotate_in_viewer(
         except KeyboardInterrupt as ending:
             if type(ending) is not KeyboardInterrupt:  # Ctrl-C ends a session, SIGTERM the program
                 raise
+            return True
         except RuntimeError:  # Rerun's thread towards the viewer is gone
             if window.running:
                 raise
         finally:
             del stream
             release()
+    return False
 
 
 def _mark(
