@@ -125,18 +125,27 @@ def _velocity_error(view: RunView, transform: Transform) -> tuple[IntArray, Floa
     return t_ns[pairs.index], ours - pairs.linear(reference.select(VELOCITY).to_numpy())
 
 
+LEAST_POSITION_SD = 1e-4
+"""m: no reference knows a position better; a filter states less just after its start, and that sample is the mean."""
+
+
 def consistency(view: RunView) -> dict[str, float]:
     """Whether the errors are as large as the filter says: normalized errors from its own standard deviations.
 
     The track is laid upon the reference at the start (``origin-yaw``), as the filter itself begins with
-    certainty there; a fitted alignment would take part of the error away. Samples whose sigma is still 0 are
-    left out.
+    certainty there; a fitted alignment would take part of the error away. Samples whose sigma is still 0, or
+    below :data:`LEAST_POSITION_SD`, are left out.
     """
     compared = view.compared("origin-yaw")
     if compared is None or not compared.on_estimate or (sigma := view.table("sigma")) is None:
         return {}  # a table of standard deviations is large: it is read where it is needed
     metrics = _normalized(
-        sigma, "pos", "position", compared.t_ns, compared.error @ compared.transform.rotation
+        sigma,
+        "pos",
+        "position",
+        compared.t_ns,
+        compared.error @ compared.transform.rotation,
+        least=LEAST_POSITION_SD,
     )
     velocity = _velocity_error(view, compared.transform)
     if velocity is not None:
@@ -179,7 +188,7 @@ def _attitude_error(view: RunView, t_ns: IntArray, transform: Transform) -> Floa
 
 
 def _normalized(
-    sigma: pl.DataFrame, part: str, name: str, t_ns: IntArray, error: FloatArray
+    sigma: pl.DataFrame, part: str, name: str, t_ns: IntArray, error: FloatArray, *, least: float = 0.0
 ) -> dict[str, float]:
     """Return normalized squared errors; ``error`` is in the estimate's own axes, where sigma is given."""
     columns = [f"sigma_{part}_{a}" for a in "xyz"]
@@ -187,7 +196,7 @@ def _normalized(
         return {}
     _, mine, theirs = np.intersect1d(t_ns, sigma["t_ns"].to_numpy(), return_indices=True)
     sd = sigma.select(columns).to_numpy()[theirs]
-    stated = np.isfinite(sd).all(axis=1) & (sd > 0).all(axis=1)
+    stated = np.isfinite(sd).all(axis=1) & (sd > least).all(axis=1)
     if not stated.any():
         return {}
     ratio = error[mine][stated] / sd[stated]

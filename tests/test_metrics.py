@@ -297,6 +297,7 @@ def noisy_view(scale: float, n: int = 4000) -> RunView:
     sd = np.column_stack((0.1 + 0.01 * t, 0.2 + 0 * t, 0.05 + 0.02 * t))
     error = rng.normal(size=(n, 3)) * sd
     error[0] = 0
+    sd[1] = 1e-7  # a filter just after its start
     sigma = pl.DataFrame(
         {"t_ns": (t * S).astype(np.int64)} | {f"sigma_pos_{a}": scale * sd[:, i] for i, a in enumerate("xyz")}
     )
