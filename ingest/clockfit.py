@@ -2,8 +2,9 @@
 
 The norm of the angular rate does not depend on frames or mounting: its cross-correlation gives the offset to a sample.
 Then offset and drift are fitted by least squares to the rates themselves, x(offset + (1 + drift) t) = A y(t) + b, with
-A and b (mounting, scale, bias) of every segment free; of several bandwidths the one with the smallest standard
-deviation counts. Nothing is compared within or beside a gap.
+A and b (mounting, scale, bias) of every segment free, and residuals weighted by the inverse of their covariance: where
+soft tissue lets the sensor lag about one axis, that axis counts less. Of several bandwidths the one with the smallest
+standard deviation counts. Nothing is compared within or beside a gap.
 """
 
 from __future__ import annotations
@@ -186,10 +187,10 @@ class _Fit(NamedTuple):
 
 def _refine(sides: Sequence[_Even], offset: float, band_hz: float) -> _Fit:
     drift, middle = 0.0, float(np.mean([s.tb[np.isfinite(s.b).all(axis=1)].mean() for s in sides]))
-    normal, residual, total, overlap, count = np.eye(2), 0.0, 1.0, 0.0, 1
-    for _ in range(12):
+    normal, residual, weighted, total, overlap, count = np.eye(2), 0.0, 0.0, 1.0, 0.0, 1
+    for turn in range(12):
         normal, gradient = np.zeros((2, 2)), np.zeros(2)
-        residual, total, count, overlap = 0.0, 0.0, 0, 0.0
+        residual, weighted, total, count, overlap = 0.0, 0.0, 0.0, 0, 0.0
         for s in sides:
             shifted = s.tb + offset + drift * (s.tb - middle)
             inside = np.isfinite(s.b).all(axis=1) & (shifted > s.ta[20]) & (shifted < s.ta[-20])
@@ -206,21 +207,31 @@ def _refine(sides: Sequence[_Even], offset: float, band_hz: float) -> _Fit:
             lever = rise * (s.tb[inside] - middle)[:, None]
             stacked = np.column_stack((now, rise, lever))
             stacked = stacked - y @ np.linalg.lstsq(y, stacked, rcond=None)[0]
-            k = now.shape[1]
-            e, columns = stacked[:, :k], (stacked[:, k : 2 * k], stacked[:, 2 * k :])
+            e, *columns = np.split(stacked, 3, axis=1)
+            residual += float(np.sum(e**2))
+            if turn > 0:  # the first turn removes what is of the coarse offset
+                white = _whitening(e)
+                e, columns = e @ white, [c @ white for c in columns]
             gradient += [np.sum(c * e) for c in columns]
             normal += [[np.sum(c * d) for d in columns] for c in columns]
-            residual += float(np.sum(e**2))
+            weighted += float(np.sum(e**2))
             total += float(np.sum((now - now.mean(axis=0)) ** 2))
             count += e.size
         step = -np.linalg.solve(normal, gradient)
         offset, drift = offset + step[0], drift + step[1]
-        if abs(step[0]) < 1e-7 and abs(step[1]) < 1e-8:
+        if turn > 0 and abs(step[0]) < 1e-7 and abs(step[1]) < 1e-8:
             break
-    variance = residual / count * RATE_HZ / (2 * band_hz)
+    variance = weighted / count * RATE_HZ / (2 * band_hz)
     sd = np.sqrt(np.diag(np.linalg.inv(normal)) * variance)
     r = float(np.sqrt(max(0.0, 1.0 - residual / total)))
     return _Fit(float(offset), float(drift), middle, float(sd[0]), float(sd[1]), r, overlap)
+
+
+def _whitening(e: FloatArray) -> FloatArray:
+    """Return W (k, k) that gives residuals e (n, k) unit covariance; the weights differ by 1000 times at most."""
+    cov = e.T @ e / len(e)
+    k = len(cov)
+    return np.linalg.cholesky(np.linalg.inv(cov + (1e-3 * np.trace(cov) / k + 1e-18) * np.eye(k)))
 
 
 def _measured(values: FloatArray) -> FloatArray:

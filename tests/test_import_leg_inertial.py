@@ -40,6 +40,19 @@ def test_headers_of_loggers(tmp_path: Path, header: str) -> None:
         assert got == pytest.approx(values, abs=1e-4)
 
 
+def test_units_in_parentheses_do_not_make_it_a_phones_table(tmp_path: Path) -> None:
+    """As phyphox writes them, but it has a table for each sensor; two of one logger are one session."""
+    header = "Time (s)," + ",".join(
+        f"{w} {a} ({u})" for w, u in (("Acc", "m/s²"), ("Gyr", "rad/s")) for a in "XYZ"
+    )
+    rows = "".join(f"{0.01 * k:.2f},0,0,9.8,0,0,{0.1 * (k % 7)}\n" for k in range(100))
+    files = [tmp_path / "a.csv", tmp_path / "b.csv"]
+    for file in files:
+        file.write_text(f"{header}\n{rows}", encoding="utf-8")
+    convert(files, tmp_path / "a.mcap", options={"segments": "thigh,shank"})
+    assert {"/leg/thigh/imu", "/leg/shank/imu"} <= set(mr.open(tmp_path / "a.mcap").channels)
+
+
 def test_units_are_said_or_refused(tmp_path: Path) -> None:
     """Without units one line names every missing one and how to say it; said, it converts."""
     path = sensor_csv(tmp_path / "thigh.csv", squats(), "thigh", "time,AccX,AccY,AccZ,GyrX,GyrY,GyrZ")

@@ -366,7 +366,8 @@ def jumps(rec: Recording, fig: Figure) -> None:
             label = f"{name}: {100.0 * float(np.mean(state == k)) if len(state) else 0.0:.0f} %"
             ax.broken_barh(bars, (k - 0.4, 0.8), facecolors=style.run_color(k), label=label)
         ax.set_yticks(range(len(names)), names)
-        _dress(ax, f"{_owner(topic)}: state, {len(edges)} changes", TIME, "")
+        _dress(ax, f"{_owner(topic)}: state, {len(edges)} changes", TIME, "", legend=False)
+        ax.legend(fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(names), frameon=False)
 
 
 def cycles(rec: Recording, fig: Figure) -> None:
