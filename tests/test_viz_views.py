@@ -446,6 +446,20 @@ def test_a_joint_s_error_is_estimate_minus_reference_within_its_band(tmp_path: P
     assert np.abs(error).max() < 0.1
 
 
+def test_the_three_angles_of_a_joint_lie_behind_each_other(tmp_path: Path) -> None:
+    table = pl.DataFrame(
+        {"t_ns": [0, 10**9]} | {k: [0.0, 0.1] for k in ("knee", "knee_abduction", "hip_rotation")}
+    )
+    rec = write(tmp_path / "a.mcap", {"/reference/joint": ("sensor_msgs/msg/JointState", table)})
+    _, canvas = drawn(rec, tmp_path)
+    stacks = {e.panel: e.stack for e in canvas.entries if e.panel.endswith("angle (°)")}
+    assert stacks == {
+        "knee angle (°)": "knee angle",
+        "knee_abduction angle (°)": "knee angle",
+        "hip_rotation angle (°)": "hip angle",
+    }
+
+
 def test_a_segment_hangs_at_the_end_of_the_one_above(tmp_path: Path) -> None:
     from .test_viz_rrd import column
     from .viz_walks import leg

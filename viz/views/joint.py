@@ -22,6 +22,7 @@ from .common import EULER, Values, euler_deg, slug
 
 FIGURE, MARKERS = "segments", "markers"
 AXIS_ENDS = tuple(f"_{a}" for a in EULER)
+JOINT_ENDS = ("_abduction", "_rotation")
 MAX_GAP_S = 0.1
 """A reference is not interpolated over longer gaps."""
 
@@ -66,7 +67,8 @@ class Angles(View):
                     self.columns[joint + suffix] = (path, factor)
                     canvas.lines(path, [f"{self.owner} {joint} ({unit})"], [color])
                     panel = f"{joint} {title} ({unit})"
-                    canvas.show("plot", path, tab=tab, panel=panel, owner=self.owner, alone=True)
+                    stack = f"{hinge_of(joint)} {title}"
+                    canvas.show("plot", path, tab=tab, panel=panel, owner=self.owner, stack=stack, alone=True)
             series_of(canvas)[self.channel.topic, joint] = Curve()
 
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
@@ -95,10 +97,8 @@ def draw_errors(view: View, names: Sequence[str]) -> None:
             path = f"{view.path}/{slug(name)}/error"
             canvas.lines(path, [f"{view.owner} {name} error (°)"], [view.color])
             canvas.scalars(path, t_ns, error)
-            # the axes of a segment lie behind each other
-            stack = f"{name.rpartition('_')[0]} error" if name.endswith(AXIS_ENDS) else ""
-            panel = error_panel(name)
-            canvas.show("plot", path, tab=JOINTS, panel=panel, owner=view.owner, stack=stack)
+            stack = error_stack(name)
+            canvas.show("plot", path, tab=JOINTS, panel=error_panel(name), owner=view.owner, stack=stack)
 
 
 class Attitudes(Values):
@@ -134,6 +134,18 @@ class Attitudes(Values):
         super().end()
         if self.role == "estimate":
             draw_errors(self, list(self.shown))
+
+
+def hinge_of(joint: str) -> str:
+    """Return the joint without its axis: the three angles of a knee lie behind each other, flexion first."""
+    for end in JOINT_ENDS:
+        joint = joint.removesuffix(end)
+    return joint
+
+
+def error_stack(name: str) -> str:
+    """Return the stack of an angle's error: the axes of a segment or a joint lie behind each other."""
+    return f"{name.rpartition('_')[0] if name.endswith(AXIS_ENDS) else hinge_of(name)} error"
 
 
 def error_panel(joint: str) -> str:
@@ -201,7 +213,10 @@ class AngleSigma(Values):
                 names=f"{self.owner} ±1σ {joint}", units="°", colors=style.rgb(self.color), widths=0.5
             )
             self.canvas.static(path, archetype)
-            self.canvas.show("plot", path, tab=JOINTS, panel=error_panel(joint), owner=self.owner)
+            stack = error_stack(joint)
+            self.canvas.show(
+                "plot", path, tab=JOINTS, panel=error_panel(joint), owner=self.owner, stack=stack
+            )
 
     def draw(self, t_ns: Times, block: pl.DataFrame) -> None:
         super().draw(t_ns, block)
