@@ -21,7 +21,7 @@ from ..recording.selection import Selection, selected_topics, within
 from ..recording.threads import Prefetch
 from .facts import origin, pretty
 from .folder import whole_folder
-from .tables import EVENT, meaning
+from .tables import EVENT, free_name, meaning
 
 VERSION = "1.9.0"
 ESTIMATE = "/estimate/"
@@ -403,8 +403,14 @@ def _write_system(
 
 def _origins(rec: Recording, system: System, later: set[str]) -> list[tuple[str, str, str, str]]:
     """Return name in the table, topic, column and kind of number of each column that is written."""
+    taken: set[str] = set()  # /leg/a/b and /leg/a_b have the same name here
     return [
-        (f"{topic.strip('/').replace('/', '_')}_{column}", topic, column, str(types[column]))
+        (
+            free_name(f"{topic.strip('/').replace('/', '_')}_{column}", taken),
+            topic,
+            column,
+            str(types[column]),
+        )
         for topic in system.topics
         for types in [rec.table(topic, start_ns=0, end_ns=0, log_time=True).schema]
         for column in [*numeric_columns(rec, topic), *([KNOWN_AT] if topic in later else [])]

@@ -260,7 +260,7 @@ def _attachments(rec: Recording, folder: Path) -> list[str]:
     taken: set[str] = set()
     for attachment in rec.attachments:
         parts = [p for p in attachment.name.replace("\\", "/").split("/") if p not in ("", ".", "..")]
-        name = _free_name("/".join(("attachments", *map(_short, parts or ["attachment"]))), taken)
+        name = free_name("/".join(("attachments", *map(_short, parts or ["attachment"]))), taken)
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(rec.attachment(attachment.name))
@@ -268,7 +268,7 @@ def _attachments(rec: Recording, folder: Path) -> list[str]:
     return written
 
 
-def _free_name(name: str, taken: set[str]) -> str:
+def free_name(name: str, taken: set[str]) -> str:
     """Return a name that is no other's, nor the folder of another; both are reserved (``a`` and ``a/b``)."""
     free, number = name, 1
     while free.lower() in taken or f"{free.lower()}/" in taken or any(f in taken for f in _folders(free)):

@@ -252,6 +252,18 @@ def test_two_recordings_of_one_name_are_refused(rec: Recording, tmp_path: Path) 
     assert not (tmp_path / "ds").exists()
 
 
+def test_bids_names_of_two_topics_differ(tmp_path: Path) -> None:
+    imu = pl.DataFrame({"t_ns": [0, 10**7]} | {f"acc_{a}": [0.0, 1.0] for a in "xyz"})
+    with mr.create(tmp_path / "a.mcap") as out:
+        for topic in ("/leg/a/imu", "/leg/a_imu"):
+            out.add_table(topic, "sensor_msgs/msg/Imu", imu)
+    export(mr.open(tmp_path / "a.mcap"), "bids", tmp_path / "ds")
+    (listing,) = (tmp_path / "ds").glob("sub-*/motion/*_channels.tsv")
+    names = pl.read_csv(listing, separator="\t")["name"]
+    assert {"leg_a_imu_acc_x", "leg_a_imu_acc_x_2"} < set(names)
+    assert names.is_unique().all()
+
+
 @pytest.mark.skipif(
     shutil.which("bids-validator-deno", path=TOOLS) is None, reason="bids-validator-deno is not installed"
 )
