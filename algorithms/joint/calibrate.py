@@ -281,9 +281,10 @@ class JointCalibrator(Calibrator):
                 continue
             pair = hinge["segments"]
             up = np.zeros((2, 3))
+            mounts = [given_mount(self.params, s) for s in pair]
             guessed = [
-                bool(long_axis(np.array(a), given_mount(self.params, s)[[0, 2]], np.array(f), u))
-                for s, a, f, u in zip(pair, hinge["axes"], hinge["mean_force_m_s2"], up, strict=True)
+                bool(long_axis(np.array(a), mount[0], mount[2], np.array(f), u))
+                for mount, a, f, u in zip(mounts, hinge["axes"], hinge["mean_force_m_s2"], up, strict=True)
             ]
             hinge["long_axes_guessed"] = [g and s not in stood for g, s in zip(guessed, pair, strict=True)]
             for segment, one, guess in zip(pair, up, guessed, strict=True):

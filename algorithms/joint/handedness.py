@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from ..contract import FloatArray
-from ..numerics.compiled import compiled
+from ..numerics.compiled import compiled, inlined
 from ..numerics.records import record_type
+from ..numerics.rotations import turn_body
 from . import axisfit
 
 WINDOW_S = 2.0
@@ -103,6 +104,18 @@ def close(s: Any, i: int) -> None:
     s.hand_windows[i] += 1
 
 
+@inlined
+def lever_column(g: FloatArray, d: FloatArray, sign: float, a: int) -> tuple[float, float, float]:
+    """Return column ``a`` of Γ: g g_a − |g|² e_a + sign · ġ × e_a, of rates ``g`` and their derivatives ``d``, (3,)."""
+    size = g[0] * g[0] + g[1] * g[1] + g[2] * g[2]
+    x, y, z = g[0] * g[a], g[1] * g[a], g[2] * g[a]
+    if a == 0:
+        return x - size, y + sign * d[2], z - sign * d[1]
+    if a == 1:
+        return x - sign * d[2], y - size, z + sign * d[0]
+    return x + sign * d[1], y - sign * d[0], z - size
+
+
 @compiled
 def look(s: Any, i: int) -> None:
     """Take sensor ``i`` of the sample given out (``acc``, ``gyr``, ``dgyr``, ``turn``, ``dt`` of ``s``)."""
@@ -123,38 +136,12 @@ def look(s: Any, i: int) -> None:
         sign = 1.0 if h == 0 else -1.0
         r = s.hand_rot[i, h]
         if s.hand_count[i] > 1:
-            # exp of the turn to second order, then Gram-Schmidt: exact enough over two seconds
-            x, y, z = sign * s.turn[i, 0], sign * s.turn[i, 1], sign * s.turn[i, 2]
-            for k in range(3):
-                p, q, w = r[k, 0], r[k, 1], r[k, 2]
-                dot = p * x + q * y + w * z
-                size = x * x + y * y + z * z
-                r[k, 0] = p + q * z - w * y + 0.5 * (dot * x - size * p)
-                r[k, 1] = q + w * x - p * z + 0.5 * (dot * y - size * q)
-                r[k, 2] = w + p * y - q * x + 0.5 * (dot * z - size * w)
-                norm = (r[k, 0] ** 2 + r[k, 1] ** 2 + r[k, 2] ** 2) ** 0.5
-                for m in range(3):
-                    r[k, m] /= norm
+            turn_body(r, sign * s.turn[i, 0], sign * s.turn[i, 1], sign * s.turn[i, 2])
         for a in range(3):
-            # Column a of Γ: g g_a − |g|² e_a + sign · ġ × e_a.
-            size = g[0] * g[0] + g[1] * g[1] + g[2] * g[2]
-            c0, c1, c2 = g[0] * g[a], g[1] * g[a], g[2] * g[a]
-            if a == 0:
-                c0, c1, c2 = c0 - size, c1 + sign * d[2], c2 - sign * d[1]
-            elif a == 1:
-                c0, c1, c2 = c0 - sign * d[2], c1 - size, c2 + sign * d[0]
-            else:
-                c0, c1, c2 = c0 + sign * d[1], c1 - sign * d[0], c2 - size
+            c0, c1, c2 = lever_column(g, d, sign, a)
             s.hand_gf[i, h, a] += c0 * f[0] + c1 * f[1] + c2 * f[2]
             for b in range(3):
-                # Gᵀ G is symmetric in a, b: entries of column b again.
-                e0, e1, e2 = g[0] * g[b], g[1] * g[b], g[2] * g[b]
-                if b == 0:
-                    e0, e1, e2 = e0 - size, e1 + sign * d[2], e2 - sign * d[1]
-                elif b == 1:
-                    e0, e1, e2 = e0 - sign * d[2], e1 - size, e2 + sign * d[0]
-                else:
-                    e0, e1, e2 = e0 + sign * d[1], e1 - sign * d[0], e2 - size
+                e0, e1, e2 = lever_column(g, d, sign, b)
                 s.hand_gg[i, h, a, b] += c0 * e0 + c1 * e1 + c2 * e2
             for k in range(3):
                 s.hand_lever[i, h, k, a] += r[k, 0] * c0 + r[k, 1] * c1 + r[k, 2] * c2

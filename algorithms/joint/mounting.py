@@ -20,7 +20,9 @@ GUESS_DEG = 30.0
 
 
 @compiled
-def long_axis(axis: FloatArray, mounting: FloatArray, force: FloatArray, up: FloatArray) -> bool:
+def long_axis(
+    axis: FloatArray, given_axis: FloatArray, given_up: FloatArray, force: FloatArray, up: FloatArray
+) -> bool:
     """Write a sensor's long axis, upwards, to ``up``; return whether it is guessed.
 
     Where the axis that was found lies far off the parameter's, this says nothing of the sensor: the mean force does, as
@@ -30,8 +32,8 @@ def long_axis(axis: FloatArray, mounting: FloatArray, force: FloatArray, up: Flo
     ----------
     axis : ndarray, shape (3,)
         Flexion axis that was found.
-    mounting : ndarray, shape (2, 3)
-        As the parameters say: flexion axis and long axis.
+    given_axis, given_up : ndarray, shape (3,)
+        Flexion axis and long axis as the parameters say.
     force : ndarray, shape (3,)
         Mean specific force of the sensor.
     up : ndarray, shape (3,)
@@ -39,7 +41,7 @@ def long_axis(axis: FloatArray, mounting: FloatArray, force: FloatArray, up: Flo
     """
     cosine, along, size = 0.0, 0.0, 0.0
     for m in range(3):
-        cosine += axis[m] * mounting[0, m]
+        cosine += axis[m] * given_axis[m]
         along += force[m] * axis[m]
     guessed = abs(cosine) < NEAR
     least = 0
@@ -50,7 +52,7 @@ def long_axis(axis: FloatArray, mounting: FloatArray, force: FloatArray, up: Flo
             least = m
     for m in range(3):
         if not guessed:
-            up[m] = mounting[1, m]
+            up[m] = given_up[m]
         elif size > 1.0:
             up[m] /= math.sqrt(size)
         else:
@@ -104,11 +106,10 @@ def orient(s: Any, lag: int) -> None:
                 s.axis[i, m] = -s.axis[i, m]
     for i in range(2):
         for m in range(3):
-            s.given_pair[0, m], s.given_pair[1, m] = s.given_axis[i, m], s.given_up[i, m]
             s.mean_force[m] = 0.0
             for k in range(s.kept):
                 s.mean_force[m] += s.rows[k, axisfit.WIDTH * i + axisfit.ACC + m] / s.kept
-        s.guessed[i] = 1 if long_axis(s.axis[i], s.given_pair, s.mean_force, s.up[i]) else 0
+        s.guessed[i] = 1 if long_axis(s.axis[i], s.given_axis[i], s.given_up[i], s.mean_force, s.up[i]) else 0
 
 
 def mounting_remarks(s: Any, segments: tuple[str, ...]) -> list[Remark]:

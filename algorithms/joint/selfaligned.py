@@ -36,7 +36,6 @@ FIELDS: list[Any] = [
     ("gravity", "f8"),
     ("given_axis", "f8", (2, 3)),
     ("given_up", "f8", (2, 3)),
-    ("given_pair", "f8", (2, 3)),  # of one sensor: axis, up
     ("mean_force", "f8", (3,)),
     ("below", "f8", (2,)),  # 1 where the sensor sits above the joint, −1 below, 0 where that says nothing
     ("is_knee", "i8"),
