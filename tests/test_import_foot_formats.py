@@ -295,6 +295,16 @@ def test_ximu_the_fewest_lost_packets_that_are_sure(tmp_path: Path, truth: Walk)
     assert tables["/foot/imu"]["t_ns"][200] == round(203 * 1e9 / 256)
 
 
+@pytest.mark.filterwarnings("error")
+def test_ximu_a_counter_that_falls_is_found_without_a_warning(tmp_path: Path, truth: Walk) -> None:
+    rows = [row.split(b",", 1)[1] for row in ximu(truth).splitlines()[:6]]
+    counters = (b"Packet number", b"3", b"5", b"0", b"-4", b"-9")
+    (path := tmp_path / "w.csv").write_bytes(
+        b"\n".join(map(b",".join, zip(counters, rows, strict=True))) + b"\n"
+    )
+    assert findings(read(XimuCsv(), path)[2])["backwards_time"] == 3
+
+
 def test_ximu_a_single_lost_packet_proves_nothing(tmp_path: Path, truth: Walk) -> None:
     rows = ximu(truth).splitlines()
     (path := tmp_path / "w.csv").write_bytes(b"\n".join(rows[:201] + rows[202:]) + b"\n")

@@ -113,8 +113,10 @@ def _frames(path: Path, header: Header, rate_hz: float, report: ReportBuilder) -
         counter = frame[COUNTER].to_numpy()
         steps = np.diff(counter, prepend=counter[0] - 1 if last is None else last)
         if a_row is None and len(steps) > 2:
-            middle = np.median(steps[1:])
-            a_row = max(1.0, float(steps[1:][(steps[1:] > 0) & (steps[1:] <= 4 * middle)].mean()))
+            usual = steps[1:][(steps[1:] > 0) & (steps[1:] <= 4 * np.median(steps[1:]))]
+            a_row = (
+                max(1.0, float(usual.mean())) if usual.size else 1.0
+            )  # none: the counter hardly ever rises
         lost = _lost(steps, a_row or 1.0, frame["line"].to_numpy(), report)
         place = row + np.cumsum(1 + lost)
         # A row that repeats the one before, counter included, is no new place in time: the clock drops it.
