@@ -128,6 +128,36 @@ def test_numbered_states_are_lanes_with_the_names_that_the_channel_gives_them(tm
     assert t_ns.tolist() == [0, 2 * 10**9, 3 * 10**9]
 
 
+def test_the_eye_follows_markers_that_walk_away_and_is_as_near_as_their_size(tmp_path: Path) -> None:
+    way = np.linspace(0.0, 30.0, 40)
+    marks = {
+        f"{n}.{a}": v
+        for n, z in (("hip", 0.9), ("heel", 0.1))
+        for a, v in zip("xyz", (0 * way, way, 0 * way + z), strict=True)
+    }
+    marks["heel.x"] = np.where(np.arange(40) % 5, marks["heel.x"], np.nan)  # hidden now and then
+    topic, table = "/reference/markers", pl.DataFrame({"t_ns": np.arange(40) * 10**9, **marks})
+    rec = write(tmp_path / "a.mcap", {topic: ("marcha_msgs/msg/OpticalMarkers", table)})
+    _, canvas = drawn(rec, tmp_path)
+    assert canvas.followed["markers"] == "/reference/markers/points"
+    low, high = canvas.solid["markers"]
+    assert 0.8 <= high[2] - low[2] < 1.6
+    assert high[1] - low[1] < 1e-6  # not the way of 30 m
+
+
+def test_a_point_of_the_markers_has_its_own_name_while_another_is_hidden(tmp_path: Path) -> None:
+    table = pl.DataFrame(
+        {"t_ns": [0, 10**9], **{f"{n}.{a}": [1.0, 1.0] for n in ("hip", "knee") for a in "xyz"}}
+    )
+    table = table.with_columns(pl.Series("hip.x", [np.nan, 1.0]), pl.Series("knee.x", [1.0, np.nan]))
+    rec = write(tmp_path / "a.mcap", {"/reference/markers": ("marcha_msgs/msg/OpticalMarkers", table)})
+    viz.write_rrd(rec, tmp_path / "a.rrd")
+    from .test_viz_rrd import column
+
+    _, names = column(tmp_path / "a.rrd", "/reference/markers/points", "Points3D:keypoint_ids")
+    assert names[:, 0].tolist() == [1, 0]
+
+
 # -- annotations -------------------------------------------------------------------------------------
 
 

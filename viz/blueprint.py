@@ -254,6 +254,7 @@ def _solid(
 ) -> rrb.Spatial3DView:
     across = high - low if least < 2.0 else (high - low)[:2]  # a walk's height is small beside its way
     centre, size = (low + high) / 2, max(float(np.linalg.norm(across)), least)
+    followed = next((c.followed[name] for c in canvases if name in c.followed), None)
     return rrb.Spatial3DView(
         origin="/",
         contents=[e.path for e in entries],
@@ -262,6 +263,7 @@ def _solid(
             position=centre + np.array([-0.12, -0.78, 0.62]) * size,
             look_target=centre,
             eye_up=(0.0, 0.0, 1.0),
+            tracking_entity=followed,
         ),
         background=rrb.Background(kind="SolidColor", color=BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=True, spacing=1.0, color=(255, 255, 255, 24)),

@@ -163,6 +163,8 @@ class Canvas:
         Corners (latitude and longitude, °) of what is on the map, empty where nothing is.
     solid : dict of str to list of ndarray
         Corners (3,), m, of what is in a panel of a space of its own (segments, markers), by panel.
+    followed : dict of str to str
+        Entity that the eye follows in such a panel, by panel: what walks through a room is small beside its way.
     store : dict
         What views of one recording share, under a name of their own.
     flat : bool
@@ -194,6 +196,7 @@ class Canvas:
         self.store: dict[str, Any] = {}
         self.geo: list[Floats] = []
         self.solid: dict[str, list[Floats]] = {}
+        self.followed: dict[str, str] = {}
         self.flat = False
         self._origin: Floats | None = None
         topics = [c.topic for c in self.channels]

@@ -11,18 +11,24 @@ from collections.abc import Sequence
 import numpy as np
 import polars as pl
 import rerun as rr
+from numpy.typing import NDArray
 
 from ...recording.rotations import xyzw_from_wxyz
 from ...replay.alignment import match
 from .. import style
 from ..canvas import ESTIMATES, JOINTS, RAW, Canvas, ChannelLike, Floats, Times, columns_of, entity
 from ..curve import Curve
+from ..text import printable
 from .base import View, role_of
 from .common import EULER, Values, euler_deg, slug
 
 FIGURE, MARKERS = "segments", "markers"
 AXIS_ENDS = tuple(f"_{a}" for a in EULER)
 JOINT_ENDS = ("_abduction", "_rotation")
+LABELS = 12
+"""Most markers whose names stand beside them without being asked; beyond, the one under the mouse says its own."""
+ROOM = 1.4
+"""How much of the view markers may leave free around them."""
 MAX_GAP_S = 0.1
 """A reference is not interpolated over longer gaps."""
 
@@ -404,7 +410,7 @@ def previous(canvas: Canvas, channel: ChannelLike) -> str | None:
 
 
 class Markers(View):
-    """Optical markers as named points in the figure, and their heights over time."""
+    """Optical markers as points with their names, which the eye follows, and their heights over time."""
 
     title = "optical markers as points, and their heights"
     schemas = ("marcha_msgs/msg/OpticalMarkers",)
@@ -413,9 +419,15 @@ class Markers(View):
         canvas = self.canvas
         self.names = [c.removesuffix(".x") for c in self.channel.columns if c.endswith(".x")]
         self.entity = f"{self.path}/points"
-        canvas.static(
-            self.entity, rr.Points3D.from_fields(colors=style.rgb(self.color), radii=rr.Radius.ui_points(5.0))
+        named = [rr.AnnotationInfo(i, printable(name)) for i, name in enumerate(self.names)]
+        described = rr.ClassDescription(info=(0, ""), keypoint_annotations=named)
+        look = rr.Points3D.from_fields(
+            colors=style.rgb(self.color),
+            radii=rr.Radius.ui_points(5.0),
+            class_ids=0,
+            show_labels=len(named) <= LABELS,
         )
+        canvas.static(self.entity, rr.AnnotationContext([described]), look)
         canvas.show("space", self.entity, tab=JOINTS, panel=MARKERS, owner=self.owner)
         colors = [style.run_color(i) for i in range(len(self.names))]
         self.heights = f"{self.path}/height"
@@ -430,9 +442,21 @@ class Markers(View):
             [columns_of(block, [f"{n}.{a}" for a in "xyz"]) for n in self.names], axis=1
         )  # (rows, markers, 3)
         self.canvas.scalars(self.heights, t_ns, places[:, :, 2])
-        seen = np.isfinite(places).all(axis=2)
-        counts = seen.sum(axis=1)
-        if seen.any():
-            self.canvas.reach(self.canvas.solid.setdefault(MARKERS, []), places[seen])
-        columns = rr.Points3D.columns(positions=places[seen].astype(np.float32)).partition(counts)
+        seen = np.asarray(np.isfinite(places).all(axis=2))
+        self._frame(places, seen)
+        columns = rr.Points3D.columns(
+            positions=places[seen].astype(np.float32),
+            keypoint_ids=np.broadcast_to(np.arange(len(self.names), dtype=np.uint16), seen.shape)[seen],
+        ).partition(seen.sum(axis=1))
         self.canvas.columns(self.entity, t_ns, columns)
+
+    def _frame(self, places: Floats, seen: NDArray[np.bool_]) -> None:
+        """Zoom to the markers of one moment: over a whole capture the way through the room is the larger."""
+        rows = seen.any(axis=1)
+        if not rows.any():
+            return
+        shown = np.where(seen[..., None], places, np.nan)[rows]
+        low, high = np.nanmin(shown, axis=1), np.nanmax(shown, axis=1)
+        half = ROOM * (high - low) / 2
+        self.canvas.reach(self.canvas.solid.setdefault(MARKERS, []), np.concatenate([-half, half]))
+        self.canvas.followed.setdefault(MARKERS, self.entity)
