@@ -170,7 +170,7 @@ def _be_child(tasks: Sequence[Callable[[], Any]], writer: int, cpu_s: float, mem
             # From here on, for each: what those before it loaded and kept is not what this one takes.
             before = _begin_memory(3 * memory)
             began = time.process_time()
-            resource.setrlimit(resource.RLIMIT_CPU, (int(began) + max(1, int(cpu_s)), resource.RLIM_INFINITY))
+            restart_clock(cpu_s)
             result, kind, detail = None, "", ""
             try:
                 result = task()
@@ -188,6 +188,12 @@ def _be_child(tasks: Sequence[Callable[[], Any]], writer: int, cpu_s: float, mem
             if kind:
                 break
     os._exit(0)
+
+
+def restart_clock(cpu_s: float = CPU_S) -> None:
+    """Let the process take so much processor time more: what it loads at first use is no work of an input."""
+    until = int(time.process_time()) + max(1, int(cpu_s))
+    resource.setrlimit(resource.RLIMIT_CPU, (until, resource.RLIM_INFINITY))
 
 
 def _begin_memory(more: int) -> int:

@@ -9,6 +9,7 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from marcha.recording.check import check
 from . import mcap, mutators, seeds, structures
 from .mutators import Mutated, Rng, pick
 from .seeds import Rows, Sample, Seeds
-from .server import Failure
+from .server import Failure, restart_clock
 
 MOST_CHARACTERS = 1200
 """Of a message."""
@@ -33,6 +34,8 @@ ZIPPED = 0.05
 """Share of logs that come in an archive."""
 BY_COMMAND = 0.04
 """Share of inputs that go through a whole command, which takes longer to read its line than a small file."""
+DRAWING = ("view", "report")
+"""Commands that load what draws, which no process that forks may have loaded: it starts threads."""
 _CODES = (0, 1, 2, 3, 4)
 _WROTE = (0, 3, 4)
 
@@ -261,7 +264,12 @@ def _use(rng: Rng, folder: Path, path: Path) -> None:
     ways = _ways(folder, path)
     at = int(rng.integers(len(ways) + 4))
     if at < len(ways):
-        command(folder, *ways[at])
+        arguments, output = ways[at]
+        if arguments[0] in DRAWING:
+            for module in ("marcha.viz.joint_figures", "matplotlib.backends.backend_agg", "scipy.signal"):
+                import_module(module)
+            restart_clock()
+        command(folder, arguments, output)
     else:
         _export(rng, folder, path, str(pick(rng, sorted(available()))))
 
