@@ -58,7 +58,8 @@ def convert(
     output : str
         Recording to write, or a folder for one recording an input.
     format : str
-        Format of the input; found by its content without it (marcha formats lists them).
+        Format of the input; found by its content without it (marcha formats lists them). Beside inputs of this
+        format one that is surely of another, such as a C3D file, keeps its own.
     mapping : Path
         TOML mapping for the format table: columns, units, time, frames.
     option : str

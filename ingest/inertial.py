@@ -16,6 +16,7 @@ import polars as pl
 from ..recording.errors import MarchaError, UsageError
 from .checks import STANDARD_GRAVITY, SensorCheck
 from .contract import ChannelSpec, ReportBuilder
+from .leg import plain_name, renamed
 from .timestamps import TimestampRepair
 from .units import conversion
 
@@ -146,6 +147,24 @@ def one_file(paths: Sequence[Path], name: str) -> Path:
     if paths[0].is_dir():
         raise UsageError(f"{paths[0]}: is a folder; format {name} reads one file")
     return paths[0]
+
+
+def segments_of(paths: Sequence[Path], segments: str | None, report: ReportBuilder) -> list[str]:
+    """Return the segment of each sensor's file: its name, or what ``segments`` says (:func:`.leg.renamed`).
+
+    Several files are taken to be of one clock, which is reported (``one_clock``).
+    """
+    own = [plain_name(p.stem) for p in paths]
+    if len(set(own)) < len(own):
+        own = [plain_name(f"{p.parent.name}_{p.stem}") for p in paths]
+    names = renamed(own, segments, paths[0])
+    if len(paths) > 1:
+        report.note(
+            "one_clock",
+            f"times of {', '.join(p.name for p in paths)} are taken to be of one clock; where each logger "
+            "has its own, put them on one before",
+        )
+    return [names[name] for name in own]
 
 
 def tables(

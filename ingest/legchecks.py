@@ -58,9 +58,8 @@ class LegWatch:
         if not self._parts:
             return report
         builder = ReportBuilder()
-        tables = {topic: pl.concat(parts) for topic, parts in self._parts.items()}
-        encoder = tables.pop("/leg/encoder", None)
-        sensors = {topic: _Sensor(table) for topic, table in tables.items()}
+        encoder = self._table("/leg/encoder") if "/leg/encoder" in self._parts else None
+        sensors = {topic: _Sensor(self._table(topic)) for topic in list(self._parts)}
         for topic, sensor in sensors.items():
             _silent(topic, sensor, builder)
             _handed(topic, sensor, builder)
@@ -75,6 +74,10 @@ class LegWatch:
             return report
         order = sorted([*report.findings, *findings], key=lambda f: (f.kind, f.first_line or -1))
         return msgspec.structs.replace(report, findings=order, lossy=report.lossy or builder.build().lossy)
+
+    def _table(self, topic: str) -> pl.DataFrame:
+        """Return what was kept of a topic, and keep it no longer."""
+        return pl.concat(self._parts.pop(topic))
 
 
 class _Sensor:

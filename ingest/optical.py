@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -19,6 +19,8 @@ from .leg import JOINTS, MARKERS, MARKERS_TOPIC, ORIENTATION, QUAT, rotations, u
 from .timestamps import TimestampRepair
 
 FloatArray = NDArray[np.float64]
+TimedTables = tuple[NDArray[np.int64], NDArray[np.int64], Sequence[tuple[str, pl.DataFrame]]]
+"""Rows of one clock: time (ns) and line of each, and topics with their columns, as many rows."""
 ROWS = 8192
 """Rows of a block."""
 ANGLES_TOPIC = "/reference/optical/joint"
@@ -53,16 +55,59 @@ def float_rows(
     names: Sequence[str],
     report: ReportBuilder,
 ) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Return rows of numbers (n, columns) and their lines; a missing cell is NaN.
-
-    Rows with more cells than ``names``, or without a number in the first column, are dropped (``bad_row``); a
-    cell that is no number becomes NaN (repair ``missing_cell``). Blank lines are nothing.
+    """Return all rows of numbers (n, columns) and their lines, as :func:`float_windows` reads them.
 
     Raises
     ------
     MarchaError
         No row is left.
     """
+    return next(float_windows(path, [(first_line, lines)], separator, names, report))
+
+
+def float_windows(
+    path: Path,
+    pieces: Iterable[tuple[int, Sequence[str]]],
+    separator: str,
+    names: Sequence[str],
+    report: ReportBuilder,
+) -> Iterator[tuple[FloatArray, NDArray[np.int64]]]:
+    """Yield rows of numbers (n, columns) and their lines piece by piece; a missing cell is NaN.
+
+    Rows with more cells than ``names``, or without a number in the first column, are dropped (``bad_row``); a
+    cell that is no number becomes NaN (repair ``missing_cell``). Blank lines are nothing.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    pieces : iterable of (int, sequence of str)
+        Number of the first line, and lines, as :func:`marcha.ingest.text.text_lines` yields them.
+    separator : str
+        Between cells; a blank stands for runs of blanks and tabs.
+    names : sequence of str
+        Of the columns.
+    report : ReportBuilder
+        Takes what is found.
+
+    Raises
+    ------
+    MarchaError
+        No row is left at the end.
+    """
+    empty = True
+    for first_line, lines in pieces:
+        values, rows = _window(lines, first_line, separator, names, report)
+        if rows.size:
+            empty = False
+            yield values, rows
+    if empty:
+        raise MarchaError(f"{path}: no row of numbers behind its header; nothing to convert")
+
+
+def _window(
+    lines: Sequence[str], first_line: int, separator: str, names: Sequence[str], report: ReportBuilder
+) -> tuple[FloatArray, NDArray[np.int64]]:
     width = len(names)
     line = np.arange(first_line, first_line + len(lines), dtype=np.int64)
     text = pl.Series(lines, dtype=pl.String).str.strip_chars_end(" ")
@@ -116,34 +161,42 @@ def float_rows(
             count=int(bad.sum()),
             line=int(line[first]),
         )
-    if not good.size:
-        raise MarchaError(f"{path}: no row of numbers behind its header; nothing to convert")
     return values, line[good]
 
 
-def blocks_of(
-    t_ns: NDArray[np.int64],
-    lines: NDArray[np.int64],
-    tables: Sequence[tuple[str, pl.DataFrame]],
-    report: ReportBuilder,
-) -> Iterator[tuple[str, pl.DataFrame]]:
+def blocks_of(windows: Iterable[TimedTables], report: ReportBuilder) -> Iterator[tuple[str, pl.DataFrame]]:
     """Yield tables of one clock block by block, times repaired and checked.
 
     Parameters
     ----------
-    t_ns, lines : ndarray
-        Time and line (or row) of every row.
-    tables : sequence of (str, polars.DataFrame)
-        Topic and its columns, as many rows.
+    windows : iterable of TimedTables
+        The rows, window by window, of the same topics and columns.
     report : ReportBuilder
         Takes what is found.
     """
-    wide = [table.rename({c: f"{k} {c}" for c in table.columns}) for k, (_, table) in enumerate(tables)]
-    frame = pl.DataFrame({"t": t_ns, "line": lines}).hstack([c for t in wide for c in t.get_columns()])
-    clock = TimestampRepair(report, tick_ns=1)
-    for block in clock.stream(frame[i : i + ROWS] for i in range(0, frame.height, ROWS)):
-        for k, (topic, table) in enumerate(tables):
-            yield topic, block.select("t_ns", *(pl.col(f"{k} {c}").alias(c) for c in table.columns))
+    plan: list[tuple[str, list[str]]] = []
+
+    def frames() -> Iterator[pl.DataFrame]:
+        for t_ns, lines, tables in windows:
+            plan[:] = [(topic, table.columns) for topic, table in tables]
+            wide = [c.alias(f"{k} {c.name}") for k, (_, table) in enumerate(tables) for c in table]
+            yield pl.DataFrame({"t": t_ns, "line": lines}).hstack(wide)
+
+    for block in TimestampRepair(report, tick_ns=1).stream(_of_rows(frames(), ROWS)):
+        for k, (topic, columns) in enumerate(plan):
+            yield topic, block.select("t_ns", *(pl.col(f"{k} {c}").alias(c) for c in columns))
+
+
+def _of_rows(frames: Iterable[pl.DataFrame], rows: int) -> Iterator[pl.DataFrame]:
+    """Yield the rows of frames in frames of equal length: what is found does not depend on how they were read."""
+    rest: pl.DataFrame | None = None
+    for frame in frames:
+        whole = frame if rest is None else pl.concat([rest, frame], rechunk=True)
+        end = whole.height // rows * rows
+        yield from (whole[i : i + rows] for i in range(0, end, rows))
+        rest = whole[end:]
+    if rest is not None:
+        yield rest
 
 
 def marker_table(names: Sequence[str], pos: FloatArray) -> pl.DataFrame:
@@ -228,7 +281,7 @@ def marker_import(
     table = marker_table(names, pos)
     spec = ChannelSpec(MARKERS_TOPIC, MARKERS, "optical", tuple(table.columns))
     tables = [(spec, table), *more, *angle_channels(t_ns, names, pos, report, options)]
-    blocks = blocks_of(t_ns, lines, [(s.topic, t) for s, t in tables], report)
+    blocks = blocks_of([(t_ns, lines, [(s.topic, t) for s, t in tables])], report)
     turning = [s.topic for s, _ in tables if s.schema == ORIENTATION]
     return Import(
         channels=[s for s, _ in tables],

@@ -23,8 +23,9 @@ from .workbook import is_workbook
 
 GROUP = "marcha.importers"
 
-#: Confidence below which a format is not a candidate, and the lead that the first must have over the second.
-CANDIDATE, LEAD = 0.3, 0.1
+#: Confidence below which a format is not a candidate, the lead that the first must have over the second, and that of
+#: a file which is of its format whatever the user says of those beside it.
+CANDIDATE, LEAD, SURE = 0.3, 0.1, 0.9
 
 
 _UTF16 = "UTF-16 text; save it as UTF-8 (iconv -f UTF-16 -t UTF-8, or the editor's “Save as”)"
@@ -195,7 +196,8 @@ def choose(
     paths : sequence of Path
         What the user gave.
     format : str, optional
-        Name of the format; without it content decides.
+        Name of the format; without it content decides. Where some of several inputs are of this format, one that
+        is surely of another keeps its own.
     stack : contextlib.ExitStack
         Keeps unpacked archives until it is closed.
     unpack_limit_gb : float
@@ -211,12 +213,13 @@ def choose(
     if not paths:
         raise UsageError("nothing to convert: give at least one file, folder or zip archive")
     wanted = get(format) if format else None
+    others = _of_others([Path(p) for p in paths], wanted) if wanted is not None and len(paths) > 1 else ()
     chosen: list[tuple[str, Path]] = []
-    for path in paths:
-        if mapped is not None and Path(path).is_file() and not recognise(Path(path)):
-            chosen.append((mapped, Path(path)))
+    for path in map(Path, paths):
+        if mapped is not None and path.is_file() and not recognise(path):
+            chosen.append((mapped, path))
         else:
-            chosen += _resolve(Path(path), wanted, stack, unpack_limit_gb)
+            chosen += _resolve(path, None if path in others else wanted, stack, unpack_limit_gb)
     sources: list[ChosenSource] = []
     for name in dict.fromkeys(name for name, _ in chosen):
         registered = get(name)
@@ -231,6 +234,15 @@ def choose(
                 f"({', '.join(p.name for p in files[:3])} …); convert them one by one"
             )
     return sources
+
+
+def _of_others(paths: Sequence[Path], wanted: Registered) -> list[Path]:
+    """Return the files which are surely of another format than the one that the user names for those beside them."""
+    files = [p for p in paths if p.is_file()]
+    own = [p for p in files if recognise(p, [wanted.importer.name])]
+    if not own:  # a format that is chosen by name only, or a file that does not look like its own
+        return []
+    return [p for p in files if p not in own and (c := recognise(p)) and c[0].confidence >= SURE]
 
 
 def share_options(sources: Sequence[ChosenSource], values: Mapping[str, Any]) -> list[CommonOptions]:

@@ -86,6 +86,33 @@ def read_blocks(path: Path, size: int | None = BLOCK_BYTES) -> Iterator[tuple[by
         raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
+def text_lines(path: Path, skip: int = 0) -> Iterator[tuple[int, list[str]]]:
+    """Yield the lines of a text file piece by piece: the number (from 1) of a piece's first line, and its lines.
+
+    Parameters
+    ----------
+    path : Path
+        The file: UTF-8, with or without a byte order mark; lines end in LF, CRLF or CR.
+    skip : int
+        So many first lines are left out.
+
+    Raises
+    ------
+    MarchaError
+        Where the file cannot be read.
+    """
+    line = 1
+    for k, (piece, final) in enumerate(read_blocks(path)):
+        piece = piece.removeprefix(BOM) if k == 0 else piece
+        lines = piece.decode("utf-8", "replace").replace("\r\n", "\n").replace("\r", "\n").split("\n")
+        if not final:  # its last LF ends a line and begins none
+            lines.pop()
+        left = max(0, skip + 1 - line)
+        if left < len(lines):
+            yield line + left, lines[left:] if left else lines
+        line += len(lines)
+
+
 def integer_rows(
     path: Path,
     limits: Sequence[tuple[int, int]],

@@ -5,14 +5,19 @@ from __future__ import annotations
 from pathlib import Path
 
 import marcha.recording as mr
+import numpy as np
 import pytest
 from marcha.ingest import convert
 from marcha.recording import MarchaError
 
+from .c3d_files import write_c3d
 from .cli_helpers import marcha
 from .leg_files import xsens_and_markers
 from .test_import_leg_contracts import sensor_csv, squats
 
+X_IO = ["Time (s)"] + [
+    f"{w} {a} ({u})" for w, u in (("Gyroscope", "deg/s"), ("Accelerometer", "g")) for a in "XYZ"
+]
 ENGLISH = "time_ms,ax_g,ay_g,az_g,gx_dps,gy_dps,gz_dps"
 PORTUGUESE = "Tempo (ms);" + ";".join(
     f"{w} {a} ({u})" for w, u in (("Aceleração", "g"), ("Velocidade angular", "graus/s")) for a in "XYZ"
@@ -51,6 +56,77 @@ def test_units_in_parentheses_do_not_make_it_a_phones_table(tmp_path: Path) -> N
         file.write_text(f"{header}\n{rows}", encoding="utf-8")
     convert(files, tmp_path / "a.mcap", options={"segments": "thigh,shank"})
     assert {"/leg/thigh/imu", "/leg/shank/imu"} <= set(mr.open(tmp_path / "a.mcap").channels)
+
+
+def sensor(path: Path, header: str) -> Path:
+    """Write 100 rows of a sensor, seconds first, with gravity on the last axis of the accelerometer."""
+    names = header.split(";" if ";" in header else ",")
+    gravity = next(k for k, name in enumerate(names) if name.startswith("Accelerometer Z"))
+    rows = [[0.01 * k, *(0.1 * ((k + j) % 7) for j in range(1, len(names)))] for k in range(100)]
+    for row in rows:
+        row[gravity] = 1.0 if "(g)" in names[gravity] else 9.8
+    text = "".join((";" if ";" in header else ",").join(f"{v:.2f}" for v in row) + "\n" for row in rows)
+    path.write_text(f"{header}\n{text}", encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        ",".join([X_IO[0], *X_IO[4:], *X_IO[1:4]]),
+        ";".join(X_IO),
+        ",".join(X_IO).replace("(g)", "(m/s^2)"),
+        ",".join([*X_IO[1:], X_IO[0]]),
+        ",".join([X_IO[0], "Battery (V)", *X_IO[1:]]),
+    ],
+    ids=["acceleration first", "semicolons", "another unit", "time last", "a column between"],
+)
+def test_words_of_x_io_in_another_header_are_of_another_logger(tmp_path: Path, header: str) -> None:
+    """x-io's software has one order, one separator and one unit of each sensor."""
+    path = sensor(tmp_path / "thigh.csv", header)
+    done = convert(path, tmp_path / "a.mcap")
+    assert done.format == "inertial-csv"
+    assert "/leg/thigh/imu" in mr.open(tmp_path / "a.mcap").channels
+
+
+@pytest.mark.parametrize(
+    "header", [X_IO, ["Timestamp (us)", *X_IO[1:]], [*X_IO, *(f"Magnetometer {a} (a.u.)" for a in "XYZ")]]
+)
+def test_headers_of_x_io_are_its_own(tmp_path: Path, header: list[str]) -> None:
+    """As the x-IMU3's software writes them, one file is a foot's."""
+    path = sensor(tmp_path / "walk.csv", ",".join(header))
+    assert convert(path, tmp_path / "a.mcap").format == "xio-csv"
+    assert set(mr.open(tmp_path / "a.mcap").channels) == {"/foot/imu"}
+
+
+def test_one_file_of_x_io_with_a_segments_name_is_on_a_leg(tmp_path: Path) -> None:
+    """Named, it is that segment's sensor, its magnetometer beside it."""
+    header = ",".join([*X_IO, *(f"Magnetometer {a} (uT)" for a in "XYZ")])
+    convert(sensor(tmp_path / "a.csv", header), tmp_path / "a.mcap", options={"segments": "shank"})
+    assert set(mr.open(tmp_path / "a.mcap").channels) == {"/leg/shank/imu", "/leg/shank/mag"}
+
+
+@pytest.mark.parametrize("name", [None, "inertial-csv", "xio-csv"])
+def test_two_sensors_with_the_header_of_x_io_stand_beside_a_c3d(tmp_path: Path, name: str | None) -> None:
+    """A format that is named is that of the sensors; the capture of markers keeps its own."""
+    files = [sensor(tmp_path / f"{segment}.csv", ",".join(X_IO)) for segment in ("thigh", "shank")]
+    rng = np.random.default_rng(1)
+    points, analogs = rng.normal(500, 10, (200, 3, 3)).round(), np.zeros((200, 1))
+    write_c3d(tmp_path / "walk.c3d", points, analogs, processor="intel", integers=False)
+    convert(
+        [*files, tmp_path / "walk.c3d"], tmp_path / "a.mcap", options={"segments": "thigh,shank"}, format=name
+    )
+    channels = mr.open(tmp_path / "a.mcap").channels
+    assert {"/leg/thigh/imu", "/leg/shank/imu", "/reference/markers"} <= set(channels)
+
+
+def test_a_named_format_is_kept_where_no_input_looks_like_it(tmp_path: Path) -> None:
+    """The user may know better: then every input is read as said, and the fault is said."""
+    points, analogs = np.full((200, 3, 3), 500.0), np.zeros((200, 1))
+    for name in "ab":
+        write_c3d(tmp_path / f"{name}.c3d", points, analogs, processor="intel", integers=False)
+    with pytest.raises(MarchaError, match=r"a\.c3d: no header line like"):
+        convert([tmp_path / "a.c3d", tmp_path / "b.c3d"], tmp_path / "a.mcap", format="inertial-csv")
 
 
 def test_units_are_said_or_refused(tmp_path: Path) -> None:

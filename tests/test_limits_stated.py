@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import ast
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
+from marcha.ingest import optical, text
+from marcha.ingest.registry import make_options
 from marcha.replay.trajectory import OutOfOrderError, in_order, stances_of, track_of, track_of_stream, way_of
 
+from . import test_import_bids, test_import_leg_formats
 from .conftest import ROOT
+from .contracts.importer import ImporterContract
 
 PAGE = (ROOT / "docs" / "limits.md").read_text(encoding="utf-8")
 SENTENCES = [line for line in PAGE.splitlines() if line.startswith("- ")]
@@ -24,6 +29,37 @@ def test_a_sentence_has_a_test(sentence: str) -> None:
     path, _, name = match[1], *match[2].rpartition(".")[1:]
     tree = ast.parse((ROOT / "tests" / Path(path)).read_text(encoding="utf-8"))
     assert name in {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+
+
+WINDOWED = [test_import_bids.TestBids, test_import_leg_formats.TestAngles]
+
+
+@pytest.mark.parametrize("contract", WINDOWED, ids=lambda c: c.importer.name)
+def test_a_table_is_read_in_windows(
+    contract: type[ImporterContract], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first rows are there before the file is read, and what is read is the same."""
+    test, read = contract(), text.read_blocks
+    sample = test.sample(tmp_path)
+    _, whole, report = test.read(sample, tmp_path)
+    taken = 0
+
+    def small(path: Path) -> Iterator[tuple[bytes, bool]]:
+        nonlocal taken
+        for piece in read(path, 2000):
+            taken += path == sample
+            yield piece
+
+    monkeypatch.setattr(text, "read_blocks", small)
+    _, windowed, again = test.read(sample, tmp_path)
+    assert again == report
+    assert windowed.keys() == whole.keys()
+    assert all(table.equals(whole[topic], null_equal=True) for topic, table in windowed.items())
+    needed, taken = taken, 0
+    monkeypatch.setattr(optical, "ROWS", 32)
+    imported = test.importer.read([sample], make_options(test.importer, test.settings(tmp_path)))
+    next(imported.blocks())
+    assert taken < needed / 2
 
 
 def pieces(table: pl.DataFrame, rows: int) -> list[pl.DataFrame]:

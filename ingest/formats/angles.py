@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
 import msgspec
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from ...recording.errors import MarchaError
 from ..contract import ChannelSpec, CommonOptions, Import, ReportBuilder
 from ..leg import JOINT_TOPIC, JOINTS, ORIENTATION, QUAT, rotations
 from ..legchecks import unwrapped
-from ..optical import FloatArray, blocks_of, float_rows, read_text
+from ..optical import FloatArray, TimedTables, blocks_of, float_windows
+from ..text import text_lines
 from ..timestamps import nanoseconds
 
+Windows = Iterator[tuple[FloatArray, NDArray[np.int64]]]
 _UNIT = re.compile(r"(?P<name>.+?)(?:_(?P<tail>deg|rad)|\s*[(\[](?P<unit>deg|rad|°)[)\]])", re.IGNORECASE)
 _TIME = re.compile(r"(t|time|timestamp)(_s|\s*[(\[]s(ec)?[)\]])?", re.IGNORECASE)
 
@@ -65,10 +68,10 @@ class Angles:
     def read(self, paths: Sequence[Path], options: AnglesOptions) -> Import:
         """Read one file."""
         path = paths[0]
-        lines = read_text(path).split("\n")
+        _, lines = next(text_lines(path), (1, [""]))
         facts, end = _facts(lines)
         if end is None:
-            return _csv(path, lines, options)
+            return _csv(path, lines[0], options)
         if not _speaks(facts):
             raise MarchaError(f"{path}: its header has neither inDegrees nor DataType=Quaternion: no angles")
         report = ReportBuilder()
@@ -80,20 +83,16 @@ class Angles:
         if names[:1] != ["time"] or len(names) < 2:
             raise MarchaError(f"{path}, line {start + 1}: column names must begin with time, not {names[:1]}")
         columns = ["time", *(f"{n} {a}" for n in names[1:] for a in "wxyz")] if quaternions else names
-        body = [x.replace(",", " ") for x in lines[start + 1 :]] if quaternions else lines[start + 1 :]
-        values, rows = float_rows(path, body, start + 2, " ", columns, report)
+        pieces = text_lines(path, start + 1)
+        if quaternions:
+            pieces = ((k, [x.replace(",", " ") for x in piece]) for k, piece in pieces)
+        windows = float_windows(path, pieces, " ", columns, report)
         device = {"clock": "device", "time": "column time (s)", "frames": "as the file has them"}
         if quaternions:
-            if options.y_up:
-                w, x, y, z = (values[:, 1 + k :: 4] for k in range(4))
-                turned = np.sqrt(0.5) * np.stack(
-                    (w - x, x + w, y - z, z + y), axis=2
-                )  # +90° about x, then it
-                values = np.column_stack((values[:, 0], turned.reshape(len(values), -1)))
-            return _orientations(names[1:], values, rows, report, device)
+            return _orientations(names[1:], windows, report, device, turn=options.y_up)
         degrees = facts.get("indegrees", "").lower() == "yes"
         factor = {n: np.pi / 180 if degrees and not re.search(r"_t[xyz]$", n) else 1.0 for n in names[1:]}
-        return _joints(names[1:], factor, values, rows, report, device)
+        return _joints(names[1:], factor, windows, report, device)
 
 
 def _facts(lines: Sequence[str]) -> tuple[dict[str, str], int | None]:
@@ -117,8 +116,8 @@ def _cells(line: str) -> list[str]:
     return [c.strip().strip('"') for c in line.rstrip(separator + " \r\n").split(separator)]
 
 
-def _csv(path: Path, lines: Sequence[str], options: AnglesOptions) -> Import:
-    cells = _cells(lines[0])
+def _csv(path: Path, header: str, options: AnglesOptions) -> Import:
+    cells = _cells(header)
     if len(cells) < 2 or not _TIME.fullmatch(cells[0]):
         raise MarchaError(f"{path}, line 1: no header of time (s) and angles, such as time,knee_deg")
     factor, names = {}, []
@@ -135,44 +134,54 @@ def _csv(path: Path, lines: Sequence[str], options: AnglesOptions) -> Import:
         names.append(name)
         factor[name] = 1.0 if unit == "rad" else np.pi / 180
     report = ReportBuilder()
-    separator = next(c for c in ",;\t" if c in lines[0])
-    values, rows = float_rows(path, lines[1:], 2, separator, cells, report)
-    return _joints(names, factor, values, rows, report, {"clock": "device", "time": f"column {cells[0]} (s)"})
+    separator = next(c for c in ",;\t" if c in header)
+    windows = float_windows(path, text_lines(path, 1), separator, cells, report)
+    return _joints(names, factor, windows, report, {"clock": "device", "time": f"column {cells[0]} (s)"})
 
 
 def _joints(
     names: Sequence[str],
     factor: dict[str, float],
-    values: FloatArray,
-    rows: np.ndarray,
+    windows: Windows,
     report: ReportBuilder,
     device: dict[str, str],
 ) -> Import:
-    table = pl.DataFrame({n: values[:, k + 1] * factor[n] for k, n in enumerate(names)})
+    def tables() -> Iterator[TimedTables]:
+        for values, rows in windows:
+            table = pl.DataFrame({n: values[:, k + 1] * factor[n] for k, n in enumerate(names)})
+            yield nanoseconds(values[:, 0], 1e9), rows, [(JOINT_TOPIC, table)]
+
     spec = ChannelSpec(
         JOINT_TOPIC, JOINTS, "", tuple(names), {"source": "table of angles, signs as in the file"}
     )
-    t_ns = nanoseconds(values[:, 0], 1e9)
-    blocks = blocks_of(t_ns, rows, [(JOINT_TOPIC, table)], report)
     return Import(
         channels=[spec],
-        blocks=unwrapped(blocks, [JOINT_TOPIC], report),
+        blocks=unwrapped(blocks_of(tables(), report), [JOINT_TOPIC], report),
         report=report,
         metadata={"device": device},
     )
 
 
 def _orientations(
-    names: Sequence[str], values: FloatArray, rows: np.ndarray, report: ReportBuilder, device: dict[str, str]
+    names: Sequence[str], windows: Windows, report: ReportBuilder, device: dict[str, str], *, turn: bool
 ) -> Import:
-    t_ns = nanoseconds(values[:, 0], 1e9)
     specs = [ChannelSpec(f"/reference/{n}/orientation", ORIENTATION, "optical") for n in names]
-    tables = [
-        (s.topic, pl.DataFrame({q: values[:, 1 + 4 * k + j] for j, q in enumerate(QUAT)}))
-        for k, s in enumerate(specs)
-    ]
-    blocks = blocks_of(t_ns, rows, tables, report)
+
+    def tables() -> Iterator[TimedTables]:
+        for values, rows in windows:
+            quats = values[:, 1:].reshape(len(values), -1, 4)
+            if turn:  # +90° about x, then it
+                w, x, y, z = np.moveaxis(quats, 2, 0)
+                quats = np.sqrt(0.5) * np.stack((w - x, x + w, y - z, z + y), axis=2)
+            yield (
+                nanoseconds(values[:, 0], 1e9),
+                rows,
+                [
+                    (s.topic, pl.DataFrame({q: quats[:, k, j] for j, q in enumerate(QUAT)}))
+                    for k, s in enumerate(specs)
+                ],
+            )
+
     topics = [s.topic for s in specs]
-    return Import(
-        channels=specs, blocks=rotations(blocks, topics, report), report=report, metadata={"device": device}
-    )
+    blocks = rotations(blocks_of(tables(), report), topics, report)
+    return Import(channels=specs, blocks=blocks, report=report, metadata={"device": device})

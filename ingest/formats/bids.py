@@ -22,8 +22,9 @@ from ...recording.event_table import read_events
 from ...recording.events import bids_events
 from ...recording.files import read_small
 from ..contract import ChannelSpec, CommonOptions, Import, ReportBuilder
-from ..optical import blocks_of, float_rows, read_text
-from ..timestamps import nanoseconds
+from ..optical import TimedTables, blocks_of, float_windows, read_text
+from ..text import text_lines
+from ..timestamps import nanoseconds, possible_rate
 from ..units import conversion
 
 _NAME = re.compile(
@@ -138,43 +139,70 @@ class _System:
 
     def blocks(self) -> Iterator[tuple[str, pl.DataFrame]]:
         """Yield the channels block by block, accounting for every row."""
+        yield from blocks_of(self._windows(), self._report)
+
+    def _windows(self) -> Iterator[TimedTables]:
         names = self._channels["name"].to_list()
-        lines = read_text(self.path).split("\n")
-        width = lines[0].count("\t") + 1 if lines[0] else 0
-        if width and width != len(names):
-            raise MarchaError(
-                f"{self.path}, line 1: has {width} columns, {_beside(self.path, 'channels.tsv').name} lists "
-                f"{len(names)}; both must agree"
-            )
-        numbered = [f"0\t{line}" if line.strip() else "" for line in lines]  # a row may begin with n/a
-        values, rows = float_rows(self.path, numbered, 1, "\t", ["row", *names], self._report)
-        values = values[:, 1:]
-        t_ns, values, rows = self._times(values, rows)
-        tables = []
-        for spec in self.specs:
-            columns: dict[str, pl.Series] = {}
-            for name, c in self._fields[spec.topic].items():
-                series = pl.Series(values[:, c.place] * c.factor + c.offset)
-                if name.endswith("_ns"):
-                    series = pl.Series(nanoseconds(values[:, c.place], 1e9, self.start_ns))
-                elif c.dtype != "Float64":
-                    series = series.cast(getattr(pl, c.dtype))
-                columns[name] = series
-            tables.append((spec.topic, pl.DataFrame(columns)))
-        yield from blocks_of(t_ns, rows, tables, self._report)
+        rate_hz = self._rate()
+        first_ns, last_ns, count = None, 0, 0
+        # A row may begin with n/a: the number that makes it a row is put before it.
+        values_of = float_windows(self.path, self._pieces(len(names)), "\t", ["row", *names], self._report)
+        for values, rows in values_of:
+            t_ns, values, rows = self._times(values[:, 1:], rows)
+            if not rows.size:
+                continue
+            first_ns = int(t_ns[0]) if first_ns is None else first_ns
+            last_ns, count = int(t_ns[-1]), count + len(t_ns)
+            yield t_ns, rows, [(spec.topic, self._table(spec.topic, values)) for spec in self.specs]
+        if self._latency is not None and rate_hz is not None and first_ns is not None and count > 2:
+            measured = (count - 1) * 1e9 / max(1, last_ns - first_ns)
+            if abs(measured / rate_hz - 1.0) > 0.02:
+                self._report.note(
+                    "rate_doubt",
+                    f"{self.path.name}: SamplingFrequency is {rate_hz:g} Hz, its LATENCY channel runs at "
+                    f"{measured:.4g} Hz: the latter is used",
+                )
+
+    def _pieces(self, count: int) -> Iterator[tuple[int, list[str]]]:
+        """Yield the table's lines with a number before each that is not blank."""
+        for first_line, lines in text_lines(self.path):
+            width = lines[0].count("\t") + 1 if first_line == 1 and lines[0] else count
+            if width != count:
+                raise MarchaError(
+                    f"{self.path}, line 1: has {width} columns, {_beside(self.path, 'channels.tsv').name} lists "
+                    f"{count}; both must agree"
+                )
+            yield first_line, [f"0\t{line}" if line.strip() else "" for line in lines]
+
+    def _table(self, topic: str, values: Floats) -> pl.DataFrame:
+        columns: dict[str, pl.Series] = {}
+        for name, c in self._fields[topic].items():
+            series = pl.Series(values[:, c.place] * c.factor + c.offset)
+            if name.endswith("_ns"):
+                series = pl.Series(nanoseconds(values[:, c.place], 1e9, self.start_ns))
+            elif c.dtype != "Float64":
+                series = series.cast(getattr(pl, c.dtype))
+            columns[name] = series
+        return pl.DataFrame(columns)
+
+    def _rate(self) -> float | None:
+        """Return the stated rate (Hz), None where there is none."""
+        rate = self._about.get("SamplingFrequency")
+        return float(min(rate, 1e300)) if isinstance(rate, int | float) and rate > 0 else None
 
     def _times(
         self, values: Floats, rows: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], Floats, NDArray[np.int64]]:
         """Return times (n,) of the rows that have one, those rows, and their lines."""
-        rate = self._about.get("SamplingFrequency")
         if self._latency is None:
-            if not isinstance(rate, int | float) or not rate > 0:
+            rate_hz = self._rate()
+            if rate_hz is None:
                 raise MarchaError(
                     f"{self.path}: has no LATENCY channel, and {_beside(self.path, 'motion.json').name} no "
                     "SamplingFrequency above 0; state one of them"
                 )
-            return nanoseconds(rows - 1, 1e9 / rate, self.start_ns), values, rows
+            possible_rate(rate_hz, self.path, "correct SamplingFrequency")
+            return nanoseconds(rows - 1, 1e9 / rate_hz, self.start_ns), values, rows
         factor, _ = conversion(str(self._channels["units"][self._latency]), "ns")
         seconds = values[:, self._latency]
         finite = np.isfinite(seconds)
@@ -186,16 +214,7 @@ class _System:
                 line=int(rows[~finite][0]),
             )
             values, rows, seconds = values[finite], rows[finite], seconds[finite]
-        t_ns = nanoseconds(seconds, factor, self.start_ns)
-        if len(t_ns) > 2 and isinstance(rate, int | float) and rate > 0:
-            measured = (len(t_ns) - 1) * 1e9 / max(1, int(t_ns[-1] - t_ns[0]))
-            if abs(measured / rate - 1.0) > 0.02:
-                self._report.note(
-                    "rate_doubt",
-                    f"{self.path.name}: SamplingFrequency is {rate:g} Hz, its LATENCY channel runs at "
-                    f"{measured:.4g} Hz: the latter is used",
-                )
-        return t_ns, values, rows
+        return nanoseconds(seconds, factor, self.start_ns), values, rows
 
 
 def _tables(path: Path) -> list[Path]:

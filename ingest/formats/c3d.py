@@ -112,12 +112,8 @@ class C3d:
         frame_ns = nanoseconds(
             head["first_frame"] * (1e9 / rate) + np.arange(len(signals)) * (1e9 / analog_rate), 1.0
         )
-        rows = blocks_of(
-            frame_ns,
-            np.arange(1, len(signals) + 1),
-            [(s.topic, t) for s, t in analog],
-            report,
-        )
+        lines = np.arange(1, len(signals) + 1)
+        rows = blocks_of([(frame_ns, lines, [(s.topic, t) for s, t in analog])], report)
         return Import(
             channels=[*channels, *(spec for spec, _ in analog)],
             blocks=chain(blocks, rows if analog else ()),

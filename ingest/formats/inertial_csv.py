@@ -31,9 +31,10 @@ from ..inertial import (
     SourceColumn,
     complete,
     note_unused,
+    segments_of,
     tables,
 )
-from ..leg import Segments, plain_name, renamed
+from ..leg import Segments
 from ..timestamps import TimestampRepair
 from ..units import conversion
 
@@ -101,28 +102,19 @@ class InertialCsv:
 
     def read(self, paths: Sequence[Path], options: InertialCsvOptions) -> Import:
         """Read the sensors of one session: their times are taken to be of one clock."""
-        own = [plain_name(p.stem) for p in paths]
-        if len(set(own)) < len(own):
-            own = [plain_name(f"{p.parent.name}_{p.stem}") for p in paths]
-        names = renamed(own, options.segments, paths[0])
         report = ReportBuilder()
+        names = segments_of(paths, options.segments, report)
         plans: list[ChannelColumns] = []
         streams: list[Iterator[tuple[str, pl.DataFrame]]] = []
-        for path, key in zip(paths, own, strict=True):
+        for path, segment in zip(paths, names, strict=True):
             header = require_header(path, _is_header, WANTED)
             columns = _columns(path, header, options)
-            of_file = _plans(names[key], columns)
+            of_file = _plans(segment, columns)
             used = [columns["t"].name, *(s.name for p in of_file for s in p.columns.values())]
             note_unused(header.names, used, report, header.line)
             frames = _frames(path, header, columns["t"], report)
             streams.append(tables(path, frames, of_file, TimestampRepair(report, tick_ns=1), report))
             plans += of_file
-        if len(paths) > 1:
-            report.note(
-                "one_clock",
-                f"times of {', '.join(p.name for p in paths)} are taken to be of one clock; where each logger "
-                "has its own, put them on one before",
-            )
         return Import(
             channels=[p.spec() for p in plans],
             blocks=chain.from_iterable(streams),

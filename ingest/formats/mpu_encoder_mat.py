@@ -116,7 +116,7 @@ class MpuEncoderMat:
         joint = {"joint.upper": first, "joint.lower": second}
         spec = ChannelSpec(ENCODER, JOINTS, "", ("joint",), joint)
         tables.append((spec, pl.DataFrame({"joint": np.radians(values["all_encoder"])})))
-        blocks = blocks_of(t_ns, lines, [(s.topic, t) for s, t in tables], report)
+        blocks = blocks_of([(t_ns, lines, [(s.topic, t) for s, t in tables])], report)
         turning = [s.topic for s, _ in tables if s.schema == ORIENTATION]
         return Import(
             channels=[s for s, _ in tables],

@@ -154,15 +154,14 @@ def _tables(folder: Path) -> list[Path]:
 
 
 def _is_header(cells: Sequence[str]) -> bool:
-    """A time and a sensor: phyphox writes one a table, so that accelerations beside rates are another logger's."""
+    """A time and a sensor: phyphox writes one a table, so that axes of two sensors are another logger's."""
     if not TIME.fullmatch(cells[0]) or len(cells) < 2:
         return False
     matches = [_CELL.fullmatch(c) for c in cells[1:]]
     units = {m["unit"] for m in matches if m}
     place = any(m and m["what"].lower() == "latitude" for m in matches)
-    third = any(m and m["what"].lower().split(" ")[-1] == "z" for m in matches) or "hPa" in units
-    quantities = {_UNITS[u] for u in units & set(_UNITS)}
-    return place or (third and bool(quantities) and not {"acc", "gyr"} <= quantities)
+    third = sum(m["what"].lower().split(" ")[-1] == "z" for m in matches if m)
+    return place or (bool(units & set(_UNITS)) and (third == 1 or (third == 0 and "hPa" in units)))
 
 
 def _saved_by_spreadsheet(head: bytes) -> bool:

@@ -66,7 +66,7 @@ class ViconCsv:
             if angles is None:
                 raise MarchaError(f"{path}: its Model Outputs hold no angles (deg, rad)")
             spec, table, section = angles
-            blocks = blocks_of(_times(section), section.lines, [(spec.topic, table)], report)
+            blocks = blocks_of([(_times(section), section.lines, [(spec.topic, table)])], report)
             return Import(
                 channels=[spec],
                 blocks=blocks,
