@@ -35,6 +35,9 @@ GREY = "#666666"
 #: Quartiles of fewer values say nothing: those groups are drawn as points.
 BOX_LEAST = 5
 
+#: A scale begins at 0 where the smallest value is below this share of the largest; correlations near 1 need a closer one.
+NEAR_ZERO = 0.5
+
 #: Dots per inch of the PNG.
 DPI = 120
 
@@ -129,7 +132,7 @@ def _scale(ax: Axes, frame: pl.DataFrame, log: bool) -> None:
     values = frame.filter(~pl.col("outlier") & pl.col("value").is_finite())["value"]
     if log and len(values) and float(values.min()) > 0:  # pyright: ignore[reportArgumentType]
         _log_scale(ax)
-    elif len(values) and float(values.min()) >= 0:  # pyright: ignore[reportArgumentType]
+    elif len(values) and 0 <= float(values.min()) < NEAR_ZERO * float(values.max()):  # pyright: ignore[reportArgumentType]
         # The margin of a scale that begins at 0 is a share of all of it: the topmost marker is drawn whole.
         ax.set_ylim(0, max(ax.get_ylim()[1], 1.06 * float(ax.dataLim.y1)))
 

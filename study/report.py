@@ -213,7 +213,7 @@ def _means(html: Html, contents: ReportContents, levels: dict[str, list[str]]) -
                 rows.append(["@published published", *cells, "@published "])
         html.table(["filter", *levels["configuration"], "all"], rows)
         for table in tables:
-            html.text(f"Published: {table.origin} {table.note}".strip(), "note")
+            html.text(f"Published: {'. '.join(t for t in (table.origin, table.note) if t)}", "note")
     extremes(html, contents.published)
     for name in base:
         if (contents.published["by"] == name).any():

@@ -130,7 +130,7 @@ def source(html: Html, contents: ReportContents) -> None:
             "walks",
             "reproduces",
         ]
-        folded(html, f"{metric}: {len(rows)} relations", head, rows, 2)
+        folded(html, f"{metric}: {len(rows)} relation{'s'[: len(rows) > 1]}", head, rows, 2)
 
 
 def comparisons(html: Html, contents: ReportContents) -> None:

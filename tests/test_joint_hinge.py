@@ -106,6 +106,22 @@ def test_soft_tissue_moves_axes_by_two_degrees_at_most() -> None:
         assert angle_deg(axis, true) < 2.0
 
 
+def test_a_noisy_accelerometer_does_not_hide_that_a_person_stands() -> None:
+    """Noise of table 5 (0.36 m/s²): the gyroscope's bias is learned in the 3 s before the walk."""
+    capture, tables, t = simulated(seed=5, duration_s=10.0, mount_deg=0.0)
+    imu = tables["thigh"]["/leg/thigh/imu"]
+    tables["thigh"]["/leg/thigh/imu"] = imu.with_columns(pl.col("gyr_x") + 0.03)
+    results = blocks(make("joint.hinge"), tables)
+    true = capture.segments["thigh"].bias_gyr[0] + 0.03
+    at_start = results["bias"].filter(pl.col("t_ns") <= 2_900_000_000)["thigh_x"][-1]
+    assert at_start == pytest.approx(true, abs=0.004)
+    found = results["joint"]
+    reference = np.interp(found["t_ns"], t, np.unwrap(capture.joints["knee"].angle))
+    error = np.degrees(found["knee"].to_numpy() - reference)
+    walking = found["t_ns"].to_numpy() > 3_000_000_000
+    assert np.sqrt(np.mean(error[walking] ** 2)) < 3.0
+
+
 def test_not_observable_is_a_verdict() -> None:
     _, tables, t = simulated(seed=3, duration_s=20.0)
     rest = np.tile([0.1, 0.0, 9.8], (len(t), 1)) + 0.01 * np.random.default_rng(0).normal(size=(len(t), 3))

@@ -63,7 +63,8 @@ DTYPE = np.dtype(
         ("rot", "f8", (MOST, 3, 3)),
         ("bias", "f8", (MOST, 3)),
         ("f", "f8", (MOST, 3)),  # force of the gravity row in the navigation frame
-        ("low", "f8", (MOST, 6)),
+        ("low", "f8", (MOST, 6)),  # mean force and rate over half a second
+        ("smooth", "f8", (MOST, 3)),  # mean force over a fifth: a sensor's noise is no motion
         ("still", "f8", (MOST,)),
         ("x", "f8", (STATES,)),
         ("P", "f8", (STATES, STATES)),
@@ -191,7 +192,7 @@ def restart(s: Any, i: int) -> None:
     s.P[6 * i + 2, 6 * i + 2] = 0.02 if hinge and level else 0.3
     s.still[i] = 0.0
     for k in range(3):
-        s.low[i, k] = s.acc[i, k]
+        s.smooth[i, k] = s.low[i, k] = s.acc[i, k]
         s.low[i, 3 + k] = s.gyr[i, k]
 
 
@@ -336,10 +337,11 @@ def connect(s: Any, j: int) -> None:
 @compiled
 def rest(s: Any, i: int) -> None:
     """Where segment ``i`` has been steady for a second, its rate is the bias."""
-    w = min(1.0, s.dt / 0.5)
+    w, v = min(1.0, s.dt / 0.5), min(1.0, s.dt / 0.2)
     da, dg, size = 0.0, 0.0, 0.0
     for k in range(3):
-        da += (s.acc[i, k] - s.low[i, k]) ** 2
+        s.smooth[i, k] += v * (s.acc[i, k] - s.smooth[i, k])
+        da += (s.smooth[i, k] - s.low[i, k]) ** 2
         dg += (s.gyr[i, k] - s.low[i, 3 + k]) ** 2
         s.low[i, k] += w * (s.acc[i, k] - s.low[i, k])
         s.low[i, 3 + k] += w * (s.gyr[i, k] - s.low[i, 3 + k])
