@@ -35,7 +35,7 @@ GREY = "#666666"
 #: Quartiles of fewer values say nothing: those groups are drawn as points.
 BOX_LEAST = 5
 
-#: A scale begins at 0 where the smallest value is below this share of the largest; correlations near 1 need a closer one.
+#: A scale begins at 0 where the smallest value is below this share of the largest: correlations near 1 do not.
 NEAR_ZERO = 0.5
 
 #: Dots per inch of the PNG.

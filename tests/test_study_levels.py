@@ -76,11 +76,20 @@ def test_a_level_alone_has_none() -> None:
 
 
 def test_the_topmost_marker_is_drawn_whole() -> None:
-    frame = values(("15IEZ+ZARU",), ("c1c2c3", "pitch"), ("EP",)).with_columns(pl.col("value") + 50.0)
+    frame = values(("15IEZ+ZARU",), ("c1c2c3", "pitch"), ("EP",)).with_columns(pl.col("value") - pl.col("value").min())
     config, _ = load("foot-length")
     (ax, *_) = figures.level_boxes(frame, config, "detector").axes
     assert ax.get_ylim()[0] == 0
     assert ax.get_ylim()[1] > 1.05 * np.max(frame["value"].to_numpy())
+
+
+def test_correlations_near_one_have_a_scale_that_shows_them() -> None:
+    frame = values(("15IEZ+ZARU",), ("c1c2c3", "pitch"), ("EP",)).with_columns(
+        value=0.98 + pl.col("value") % 0.01
+    )
+    config, _ = load("foot-length")
+    (ax, *_) = figures.level_boxes(frame, config, "detector").axes
+    assert ax.get_ylim()[0] > 0.9
 
 
 def test_few_walks_a_configuration_have_one_q_q_plot_together() -> None:
