@@ -76,7 +76,9 @@ def test_a_level_alone_has_none() -> None:
 
 
 def test_the_topmost_marker_is_drawn_whole() -> None:
-    frame = values(("15IEZ+ZARU",), ("c1c2c3", "pitch"), ("EP",)).with_columns(pl.col("value") - pl.col("value").min())
+    frame = values(("15IEZ+ZARU",), ("c1c2c3", "pitch"), ("EP",)).with_columns(
+        pl.col("value") - pl.col("value").min()
+    )
     config, _ = load("foot-length")
     (ax, *_) = figures.level_boxes(frame, config, "detector").axes
     assert ax.get_ylim()[0] == 0
