@@ -65,9 +65,11 @@ def _all(folder: Path, count: int) -> list[tuple[str, float, float]]:
     folder.mkdir()
     log, rec, done = folder / "conf-3333-walk.csv", folder / "walk.mcap", folder / "done.mcap"
     _serial(log, count)
+    _sensor(folder / "shank.csv", count)
     _recording(rec, count)
     commands: list[tuple[str, list[object]]] = [
         ("convert", ["convert", log, "-o", folder / "out.mcap"]),
+        ("convert inertial-csv", ["convert", folder / "shank.csv", "-o", folder / "leg.mcap"]),
         ("check", ["check", rec]),
         ("replay", ["replay", rec, "-e", "foot.9iez", "-o", done]),
         ("evaluate", ["evaluate", done]),
@@ -108,6 +110,17 @@ def _serial(path: Path, count: int) -> None:
             )
             table = np.column_stack([np.arange(start, start + n) * 10, raw, raw])
             pl.from_numpy(table).write_csv(out, include_header=False)
+
+
+def _sensor(path: Path, count: int) -> None:
+    """Write the table of one sensor on a leg, of the text formats the one whose checks hold most."""
+    names = ["time_ms", *(f"a{a}_g" for a in "xyz"), *(f"g{a}_dps" for a in "xyz")]
+    with path.open("wb") as out:
+        for start in range(0, count, PIECE):
+            n = min(PIECE, count - start)
+            walk = _walk(start, n) * np.array([1 / 9.80665] * 3 + [180 / np.pi] * 3)
+            table = pl.DataFrame(np.column_stack([np.arange(start, start + n) * 10.0, walk]), schema=names)
+            table.write_csv(out, include_header=start == 0, float_precision=5)
 
 
 def _recording(path: Path, count: int) -> None:

@@ -6,20 +6,17 @@ acceleration and gravity have the opposite sign unless "Standardise Units & Fram
 
 from __future__ import annotations
 
-import contextlib
 import math
-import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import msgspec
 import numpy as np
 import polars as pl
 
-from ...recording.errors import MarchaError
 from ..checks import STANDARD_GRAVITY
-from ..columns import find_header, float_blocks, require_header
+from ..columns import find_header
 from ..contract import CommonOptions, Import, ReportBuilder, SourceAttachment
 from ..phonelog import (
     ACC,
@@ -42,22 +39,9 @@ from ..phonelog import (
     require_rows,
     xyz,
 )
+from ..sensortables import TRIPLES, SensorTable, Tables, files_of, heads_of, is_header, read_tables
 from ..text import start_of
 
-WANTED = "time,seconds_elapsed,z,y,x"
-READ = (
-    "Accelerometer", "TotalAcceleration", "Gravity", "AccelerometerUncalibrated", "Gyroscope",
-    "GyroscopeUncalibrated", "Magnetometer", "MagnetometerUncalibrated", "Location", "LocationGps", "Barometer",
-    "Pedometer", "Orientation",
-)  # fmt: skip
-_TRIPLES = READ[:8]
-"""Tables of three axes."""
-_TEXT = ("sensor", "name", "text", "standardisation")
-_NUMBERS = {
-    "time", "seconds_elapsed", "x", "y", "z", "latitude", "longitude", "altitude", "horizontalAccuracy",
-    "verticalAccuracy", "speed", "bearing", "pressure", "steps", "qw", "qx", "qy", "qz",
-}  # fmt: skip
-"""Columns that are read; others may be text, as the times for people that the app writes if told to."""
 _Q = ("qw", "qx", "qy", "qz")
 _AGREES, _CLEARER = np.radians(20.0), np.radians(60.0)
 """An orientation is believed whose vertical lies as near to the measured force, in the median; and the other
@@ -95,13 +79,13 @@ class SensorLogger:
     def sniff(self, head: bytes, path: Path) -> float:
         """Its columns, keys or tables."""
         if path.is_dir():
-            folders = {p.parent for p in _files(path) if find_header(start_of(p), _is_header)}
+            folders = {p.parent for p in files_of(path) if find_header(start_of(p), is_header)}
             return 0.92 if len(folders) == 1 else 0.0  # several folders are several recordings
         if head.startswith(b"SQLite format 3\x00"):
             return 0.9 if b"seconds_elapsed" in head else 0.0
         if head.lstrip().startswith(b"["):
             return 0.9 if b'"seconds_elapsed"' in head and b'"sensor"' in head else 0.0
-        return 0.9 if find_header(head, _is_header) else 0.0
+        return 0.9 if find_header(head, is_header) else 0.0
 
     def chief(self, path: Path) -> Path:
         """Return the folder of a table: a recording is all of its tables."""
@@ -112,7 +96,7 @@ class SensorLogger:
         path = paths[0]
         report = ReportBuilder()
         attachments: list[SourceAttachment] = []
-        tables, about = _tables(path, report)
+        tables, about = read_tables(path, report)
         platform = options.platform or about.get("platform", "").lower()
         stated = about.get("standardisation", "").lower()
         standard = (
@@ -132,10 +116,10 @@ class SensorLogger:
                     else f"the magnetic field there and gravity have {'iOS' if turned else 'Android'}'s signs"
                 ),
             )
-        streams = list(_streams(path, tables, turned, platform, report, attachments))
+        streams, others = _streams(path, tables, turned, platform, report, attachments)
         return Import(
             channels=declared(s for s, _ in streams),
-            blocks=_blocks(path, streams),
+            blocks=_blocks(path, streams, others, report),
             report=report,
             attachments=attachments,
             metadata={
@@ -157,21 +141,23 @@ class SensorLogger:
         )
 
 
-def _turned_by_field(tables: dict[str, pl.DataFrame]) -> bool | None:
+def _turned_by_field(tables: Tables) -> bool | None:
     """Return whether gravity has iOS's sign, by the dip of the field at the first fix; None if it cannot tell."""
     gravity = tables.get("Gravity", tables.get("TotalAcceleration"))
     fixes = tables.get("LocationGps", tables.get("Location"))
-    if gravity is None or fixes is None or not {"latitude", "longitude"} <= set(fixes.columns):
+    if gravity is None or fixes is None or not {"latitude", "longitude"} <= set(fixes.head.columns):
         return None
-    fixes = fixes.filter(pl.col("latitude").abs() <= 90, pl.col("longitude").abs() <= 180)
-    field = _beside(tables.get("Magnetometer"), gravity)
-    if field is None or not fixes.height or not set("xyz") <= set(gravity.columns):
+    places = fixes.head.filter(pl.col("latitude").abs() <= 90, pl.col("longitude").abs() <= 180)
+    forces, fields = heads_of(gravity, tables.get("Magnetometer"))
+    assert forces is not None
+    field = _beside(fields, forces)
+    if field is None or not places.height or not set("xyz") <= set(forces.columns):
         return None
     from ..simulate.phone_world import earth_field
 
-    there = earth_field(fixes["latitude"][0], fixes["longitude"][0], 0.0, fixes["t"][0])
+    there = earth_field(places["latitude"][0], places["longitude"][0], 0.0, places["t"][0])
     expected = math.asin(there[2] / float(np.linalg.norm(there)))
-    up = gravity.select("x", "y", "z").to_numpy()
+    up = forces.select("x", "y", "z").to_numpy()
     size = np.linalg.norm(up, axis=1) * np.linalg.norm(field, axis=1)
     good = np.isfinite(size) & (size > 0)
     if not good.any():
@@ -182,124 +168,30 @@ def _turned_by_field(tables: dict[str, pl.DataFrame]) -> bool | None:
     return True if abs(dip + expected) < _NEAR_DIP < abs(dip - expected) else None
 
 
-def _files(folder: Path) -> list[Path]:
-    return sorted(p for p in (*folder.glob("*.csv"), *folder.glob("*/*.csv")) if p.is_file())
-
-
-def _is_header(cells: Sequence[str]) -> bool:
-    return "time" in cells and "seconds_elapsed" in cells
-
-
-def _tables(path: Path, report: ReportBuilder) -> tuple[dict[str, pl.DataFrame], dict[str, str]]:
-    """Return what is read: a table a sensor (``t`` ns, ``line``, numbers), and the metadata."""
-    if path.is_dir():
-        files, about = _files(path), {}
-        for file in files:
-            if file.stem.lower() == "metadata":
-                about = _first_row(file)
-        tables = {f.stem: _csv(f, report) for f in files if f.stem in READ}
-        return {k: v for k, v in tables.items() if v is not None}, about
-    head = start_of(path)
-    if head.startswith(b"SQLite format 3\x00"):
-        return _sqlite(path)
-    if head.lstrip().startswith(b"["):
-        return _json(path)
-    table = _csv(path, report)
-    name = path.stem if path.stem in READ else ""
-    if not name:
-        raise MarchaError(f"{path}: its name says no sensor; one of {', '.join(READ)}.csv")
-    return ({name: table} if table is not None else {}), {}
-
-
-def _first_row(file: Path) -> dict[str, str]:
-    try:
-        rows = pl.read_csv(file, infer_schema=False, n_rows=1)
-    except (OSError, pl.exceptions.PolarsError) as error:
-        raise MarchaError(f"{file}: cannot be read: {str(error).splitlines()[0]}") from None
-    return {k: v for k, v in rows.row(0, named=True).items() if v} if rows.height else {}
-
-
-def _csv(file: Path, report: ReportBuilder) -> pl.DataFrame | None:
-    header = require_header(file, _is_header, WANTED)
-    try:
-        texts = [n for n in header.names if n not in _NUMBERS]
-        blocks = list(float_blocks(file, header, "time", report, integers=("time",), texts=texts))
-    except MarchaError as error:
-        if "ends before its first row" not in str(error):
-            raise
-        blocks = []
-    if not blocks:
-        report.note("header_only", f"{file.name}: has a header and no row: no channel", subject=file.name)
-        return None
-    return pl.concat(blocks).rename({"time": "t"})
-
-
-def _numbers(rows: pl.DataFrame) -> pl.DataFrame:
-    """Return a table of text as numbers; ``time`` whole."""
-    t = rows["time"].cast(pl.String).cast(pl.Int64, strict=False)
-    others = [c for c in rows.columns if c not in ("time", *_TEXT)]
-    table = rows.select(
-        pl.col(c).cast(pl.String).cast(pl.Float64, strict=False).fill_null(np.nan) for c in others
-    )
-    line = pl.Series("line", np.arange(1, rows.height + 1))
-    return table.with_columns(t=t, line=line).drop_nulls("t")
-
-
-def _json(path: Path) -> tuple[dict[str, pl.DataFrame], dict[str, str]]:
-    try:
-        rows = msgspec.json.decode(path.read_bytes(), type=list[dict[str, Any]])
-    except (OSError, msgspec.MsgspecError) as error:
-        raise MarchaError(f"{path}: not a whole JSON of Sensor Logger: {error}") from None
-    by_sensor: dict[str, list[dict[str, Any]]] = {}
-    for row in rows:
-        by_sensor.setdefault(str(row.get("sensor", "")), []).append(row)
-    about = {k: str(v) for k, v in (by_sensor.get("Metadata") or [{}])[0].items()}
-    tables = {k: pl.DataFrame(v, infer_schema_length=None) for k, v in by_sensor.items() if k in READ}
-    return {k: _numbers(v) for k, v in tables.items() if "time" in v.columns}, about
-
-
-def _sqlite(path: Path) -> tuple[dict[str, pl.DataFrame], dict[str, str]]:
-    tables: dict[str, pl.DataFrame] = {}
-    about: dict[str, str] = {}
-    try:
-        with contextlib.closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as base:
-            names = [r[0] for r in base.execute("select name from sqlite_master where type = 'table'")]
-            for name in names:
-                if name not in READ and name.lower() != "metadata":
-                    continue
-                cursor = base.execute(f'select * from "{name}"')  # a name of READ: no foreign text
-                columns = [c[0] for c in cursor.description]
-                rows = [[None if v is None else str(v) for v in row] for row in cursor]
-                if name.lower() == "metadata":
-                    about = {c: v for c, v in zip(columns, rows[0], strict=True) if v} if rows else {}
-                elif rows and "time" in columns:
-                    data = dict(zip(columns, map(list, zip(*rows, strict=True)), strict=True))
-                    tables[name] = _numbers(pl.DataFrame(data, schema=dict.fromkeys(columns, pl.String)))
-    except sqlite3.Error as error:
-        raise MarchaError(f"{path}: the database cannot be read: {error}") from None
-    return tables, about
-
-
 def _streams(
     path: Path,
-    tables: dict[str, pl.DataFrame],
+    tables: Tables,
     turned: bool,
     platform: str,
     report: ReportBuilder,
     attachments: list[SourceAttachment],
-) -> Iterator[tuple[Stream, pl.DataFrame]]:
+) -> tuple[list[tuple[Stream, SensorTable]], list[SensorTable]]:
+    """Return the streams and what each is read from, and the tables of which none is made."""
     axes = ("x", "y", "z")
     sign = -1.0 if turned else 1.0
-    for name in [n for n in _TRIPLES if n in tables and not set(axes) <= set(tables[n].columns)]:
-        rows = tables.pop(name).height
+    for name in [n for n in TRIPLES if n in tables and not set(axes) <= set(tables[n].head.columns)]:
+        rows = sum(frame.height for frame in tables.pop(name).frames(report))
         report.drop("missing_column", f"{name}: not all of the columns x, y, z; left out", count=rows)
-    acc = _acceleration(tables, turned, report)
+    left = dict(tables)
+    streams: list[tuple[Stream, SensorTable]] = []
+
+    def add(parts: Sequence[StreamChannel], subject: str, table: SensorTable, *, even: bool = True) -> None:
+        stream = Stream(parts, report, subject=subject, even=even, attachments=attachments)
+        streams.append((stream, table))
+
+    how, acc = _acceleration(left, turned)
     if acc is not None:
-        how, frame = acc
-        yield (
-            Stream([imu_part("/phone/acc", xyz(ACC, axes), gravity=how)], report, subject="acceleration"),
-            frame,
-        )
+        add([imu_part("/phone/acc", xyz(ACC, axes), gravity=how)], "acceleration", acc)
     elif "Accelerometer" in tables:
         report.loss(
             "gravity_free",
@@ -308,96 +200,114 @@ def _streams(
         part = StreamChannel(
             "/phone/linear_acc", VALUES, xyz(ACC, axes, sign), ACC, metadata={"gravity": "removed"}
         )
-        yield Stream([part], report, subject="Accelerometer"), tables["Accelerometer"]
+        add([part], "Accelerometer", left.pop("Accelerometer"))
     for topic, names in (("/phone/gyr", "Gyroscope"), ("/phone/mag", "Magnetometer")):
         name = next((n for n in (names, f"{names}Uncalibrated") if n in tables), None)
-        if name is not None and all(a in tables[name].columns for a in axes):
+        if name is not None and all(a in tables[name].head.columns for a in axes):
             part = (
                 imu_part(topic, xyz(GYR, axes), source=name)
                 if names == "Gyroscope"
                 else StreamChannel(topic, MAG, xyz(FIELD, axes, MICROTESLA), metadata={"source": name})
             )
-            yield Stream([part], report, subject=name), tables[name]
+            add([part], name, left.pop(name))
     name = next((n for n in ("LocationGps", "Location") if n in tables), None)
     if name is not None:
         wanted = {
             "lat": "latitude", "lon": "longitude", "alt": "altitude",
             "accuracy": "horizontalAccuracy", "vertical": "verticalAccuracy", "speed": "speed", "course": "bearing",
         }  # fmt: skip
-        columns = {k: v for k, v in wanted.items() if v in tables[name].columns}
+        columns = {k: v for k, v in wanted.items() if v in tables[name].head.columns}
         if "lat" in columns and "lon" in columns:
-            fixes = Stream([fix_part(columns)], report, subject=name, even=False, attachments=attachments)
-            yield fixes, tables[name]
-    if "Barometer" in tables and "pressure" in tables["Barometer"].columns:
+            add([fix_part(columns)], name, left.pop(name), even=False)
+    if "Barometer" in tables and "pressure" in tables["Barometer"].head.columns:
         part = StreamChannel(
             "/phone/pressure", PRESSURE, {"pressure_pa": SourceColumn("pressure", HECTOPASCAL)}
         )
-        yield Stream([part], report, subject="Barometer", even=False), tables["Barometer"]
-    if "Pedometer" in tables and "steps" in tables["Pedometer"].columns:
+        add([part], "Barometer", left.pop("Barometer"), even=False)
+    if "Pedometer" in tables and "steps" in tables["Pedometer"].head.columns:
         part = StreamChannel("/phone/steps", VALUES, {"steps": SourceColumn("steps", 1.0)}, ("steps",))
-        yield Stream([part], report, subject="Pedometer", even=False), tables["Pedometer"]
+        add([part], "Pedometer", left.pop("Pedometer"), even=False)
+    told, turn = _orientation(tables, acc, platform)
+    if told:
+        table = left.pop("Orientation")
+        if turn is None:
+            report.loss(
+                "odd_orientation",
+                "Orientation: its vertical is not that of the acceleration, turned either way: left out",
+                count=sum(len(_quaternions(frame)[1]) for frame in table.frames(report)),
+            )
+        else:
+            north = "true" if platform == "ios" else "magnetic"
+            part = StreamChannel(
+                "/phone/orientation",
+                QUATERNION,
+                {q: SourceColumn(q, 1.0) for q in QUAT},
+                metadata={"north": north},
+            )
+            add([part], "Orientation", table.each(turn.frame))
+    return streams, list(left.values())
 
-    oriented = _orientation(tables, acc[1] if acc is not None else None, platform, report)
-    if oriented is not None:
-        north, frame = oriented
-        part = StreamChannel(
-            "/phone/orientation",
-            QUATERNION,
-            {q: SourceColumn(q, 1.0) for q in QUAT},
-            metadata={"north": north},
-        )
-        yield Stream([part], report, subject="Orientation"), frame
+
+class _Turn(NamedTuple):
+    """What takes a quaternion of the app to ``rot_nb`` (n: east, north, up)."""
+
+    inverse: bool
+    north: bool
+    """Whether its n has x north."""
+
+    def apply(self, values: np.ndarray) -> Any:
+        """Return rotations (n,) of quaternions x, y, z, w (n, 4)."""
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_quat(values)
+        turn = turn.inv() if self.inverse else turn
+        return Rotation.from_euler("z", 90, degrees=True) * turn if self.north else turn
+
+    def frame(self, rows: pl.DataFrame) -> pl.DataFrame:
+        """Return ``t``, ``line`` and the quaternion of the rows that have one."""
+        rows, values = _quaternions(rows)
+        x, y, z, w = self.apply(values).as_quat(canonical=True).T if len(values) else np.empty((4, 0))
+        made = dict(zip(QUAT, (w, x, y, z), strict=True))
+        return rows.select("t", "line").with_columns(pl.Series(k, v) for k, v in made.items())
 
 
-def _orientation(
-    tables: dict[str, pl.DataFrame], acc: pl.DataFrame | None, platform: str, report: ReportBuilder
-) -> tuple[str, pl.DataFrame] | None:
-    """Return the phone's own orientation as ``rot_nb`` (n: east, north, up), and which north it has.
+def _quaternions(rows: pl.DataFrame) -> tuple[pl.DataFrame, np.ndarray]:
+    """Return the rows that have a quaternion, and those as x, y, z, w (n, 4)."""
+    values = rows.select(_Q[1:] + _Q[:1]).to_numpy()
+    good = np.isfinite(values).all(axis=1) & (np.linalg.norm(values, axis=1) > 0.1)
+    return rows.filter(pl.Series(good)), values[good]
+
+
+def _orientation(tables: Tables, acc: SensorTable | None, platform: str) -> tuple[bool, _Turn | None]:
+    """Return whether the phone's own orientation can be judged, and how it is turned, None where it is wrong.
 
     The quaternion takes b to n or back, and its n has x east (Android) or north (iOS): of these the one is taken whose
-    vertical is the measured force and whose north is the measured field; without a field, the platform's.
+    vertical is the measured force and whose north is the measured field; without a field, the platform's. The first
+    rows are looked at.
     """
     table = tables.get("Orientation")
-    if table is None or not table.height or acc is None or not acc.height:
-        return None
-    if any(q not in table.columns for q in _Q):
-        return None
-    values = table.select(_Q[1:] + _Q[:1]).to_numpy()
-    good = np.isfinite(values).all(axis=1) & (np.linalg.norm(values, axis=1) > 0.1)
-    table, values = table.filter(pl.Series(good)), values[good]
-    if not len(values):
-        return None
-    from scipy.spatial.transform import Rotation
-
-    to_east = Rotation.from_euler("z", 90, degrees=True)
-    force, field = _beside(acc, table), _beside(tables.get("Magnetometer"), table)
-    if force is None:
-        return None
-    best: tuple[tuple[float, float], Any] | None = None
+    if table is None or acc is None or any(q not in table.head.columns for q in _Q):
+        return False, None
+    rows, forces, fields = heads_of(table, acc, tables.get("Magnetometer"))
+    assert rows is not None
+    rows, values = _quaternions(rows)
+    force, field = _beside(forces, rows), _beside(fields, rows)
+    if not len(values) or force is None:
+        return False, None
+    best: tuple[float, _Turn] | None = None
     ios = platform == "ios"
     for inverse, north in ((False, ios), (True, ios), (False, not ios), (True, not ios)):
-        turn = Rotation.from_quat(values)
-        turn = turn.inv() if inverse else turn
-        turn = to_east * turn if north else turn
-        up = turn.apply(force)[:, 2] / np.linalg.norm(force, axis=1)
+        turn = _Turn(inverse, north)
+        rot = turn.apply(values)
+        up = rot.apply(force)[:, 2] / np.linalg.norm(force, axis=1)
         tilt = float(np.nanmedian(np.arccos(np.clip(up, -1, 1))))
         aside = 0.0
         if field is not None:
-            east, ahead = turn.apply(field)[:, :2].mean(axis=0)
+            east, ahead = rot.apply(field)[:, :2].mean(axis=0)
             aside = abs(math.atan2(east, ahead))
-        if tilt <= _AGREES and (best is None or aside < best[0][1] - _CLEARER):
-            best = (tilt, aside), turn
-    if best is None:
-        report.loss(
-            "odd_orientation",
-            "Orientation: its vertical is not that of the acceleration, turned either way: left out",
-            count=len(values),
-        )
-        return None
-    x, y, z, w = best[1].as_quat(canonical=True).T
-    made = dict(zip(QUAT, (w, x, y, z), strict=True))
-    frame = table.select("t", "line").with_columns(pl.Series(k, v) for k, v in made.items())
-    return "true" if platform == "ios" else "magnetic", frame
+        if tilt <= _AGREES and (best is None or aside < best[0] - _CLEARER):
+            best = aside, turn
+    return True, None if best is None else best[1]
 
 
 def _beside(table: pl.DataFrame | None, times: pl.DataFrame) -> np.ndarray | None:
@@ -410,36 +320,73 @@ def _beside(table: pl.DataFrame | None, times: pl.DataFrame) -> np.ndarray | Non
     )
 
 
-def _acceleration(
-    tables: dict[str, pl.DataFrame], turned: bool, report: ReportBuilder
-) -> tuple[str, pl.DataFrame] | None:
-    """Return the acceleration with gravity in Android's sign, and how it came about."""
+def _acceleration(left: Tables, turned: bool) -> tuple[str, SensorTable | None]:
+    """Return how the acceleration with gravity came about and itself, in Android's sign; its tables leave ``left``."""
     sign = -1.0 if turned else 1.0
-    if "TotalAcceleration" in tables:
-        return "included", _scaled(tables["TotalAcceleration"], sign)
-    if "Accelerometer" in tables and "Gravity" in tables and tables["Gravity"].height:
-        acc, gravity = tables["Accelerometer"], tables["Gravity"].sort("t")
-        summed = acc.select("t", "line").with_columns(
-            pl.Series(
-                a,
-                acc[a].to_numpy()
-                + np.interp(acc["t"].to_numpy(), gravity["t"].to_numpy(), gravity[a].to_numpy()),
-            )
-            for a in "xyz"
+    if "TotalAcceleration" in left:
+        return "included", _scaled(left.pop("TotalAcceleration"), sign)
+    if "Accelerometer" in left and "Gravity" in left and left["Gravity"].head.height:
+        acc, gravity = left.pop("Accelerometer"), left.pop("Gravity")
+        head, more = heads_of(acc, gravity)
+        assert head is not None
+        assert more is not None
+        summed = SensorTable(
+            pl.concat(_with_gravity([head], [more], ReportBuilder())),
+            lambda report: _with_gravity(acc.frames(report), gravity.frames(report), report),
+            whole=acc.whole and gravity.whole,
         )
-        report.keep(gravity.height)  # its rows are in the sums
         return "Accelerometer + Gravity at the accelerometer's times", _scaled(summed, sign)
-    if "AccelerometerUncalibrated" in tables:
+    if "AccelerometerUncalibrated" in left:
         factor = -STANDARD_GRAVITY if turned else 1.0
-        return "included (uncalibrated)", _scaled(tables["AccelerometerUncalibrated"], factor)
-    return None
+        return "included (uncalibrated)", _scaled(left.pop("AccelerometerUncalibrated"), factor)
+    return "", None
 
 
-def _scaled(table: pl.DataFrame, factor: float) -> pl.DataFrame:
-    return table.with_columns(pl.col(a) * factor for a in "xyz")
+def _with_gravity(
+    acc: Iterable[pl.DataFrame], gravity: Iterable[pl.DataFrame], report: ReportBuilder
+) -> Iterator[pl.DataFrame]:
+    """Yield accelerations with gravity at their times, both read in pieces.
+
+    A piece of gravity more than needed is held on either side: times may step back a little.
+    """
+    pieces, near = iter(gravity), list[pl.DataFrame]()
+
+    def pull() -> bool:
+        piece = next(pieces, None)
+        if piece is not None:
+            report.keep(piece.height)  # its rows are in the sums
+            near.append(piece)
+        return piece is not None
+
+    for frame in acc:
+        if not frame.height:
+            yield frame.select("t", "line", *"xyz")
+            continue
+        t = frame["t"].to_numpy()
+        while (not near or near[-1]["t"].to_numpy().min() <= t.max()) and pull():
+            pass
+        while len(near) > 2 and near[1]["t"].to_numpy().max() < t.min():
+            near.pop(0)
+        beside = _beside(pl.concat(near), frame)
+        assert beside is not None
+        yield frame.select("t", "line", *(pl.col(a) + pl.Series(beside[:, k]) for k, a in enumerate("xyz")))
+    while pull():
+        near.pop()
 
 
-def _blocks(path: Path, streams: list[tuple[Stream, pl.DataFrame]]) -> Iterator[tuple[str, pl.DataFrame]]:
-    for stream, frame in streams:
-        yield from stream.pull([frame])
+def _scaled(table: SensorTable, factor: float) -> SensorTable:
+    return table.each(lambda frame: frame.with_columns(pl.col(a) * factor for a in "xyz"))
+
+
+def _blocks(
+    path: Path,
+    streams: Sequence[tuple[Stream, SensorTable]],
+    others: Sequence[SensorTable],
+    report: ReportBuilder,
+) -> Iterator[tuple[str, pl.DataFrame]]:
+    for stream, table in streams:
+        yield from stream.pull(table.frames(report))
+    for table in others:  # for what is wrong with them
+        for _ in table.frames(report):
+            pass
     require_rows(path, [s for s, _ in streams])
