@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -13,7 +13,7 @@ import numpy as np
 from ..calibration import Calibration, Calibrator, Stretch
 from ..contract import AlgorithmError, FloatArray, Input
 from ..parameters import meta
-from . import axisfit, handedness, hingefit, vectorfit
+from . import axisfit, handedness, hingefit, mounting, vectorfit
 from .common import (
     IMU_COLUMNS,
     given_mount,
@@ -22,10 +22,10 @@ from .common import (
     mirrored_remark,
     mount_of,
     per_segment,
+    states_axis,
     vector,
 )
 from .merge import SEGMENTS
-from .mounting import GUESS_DEG, NEAR, SKEWED, long_axis, skewness
 
 MOST_ROWS = 20_000
 
@@ -48,10 +48,11 @@ class JointCalibrationParams(msgspec.Struct, frozen=True, forbid_unknown_fields=
     axis: Annotated[
         str,
         meta(
-            "Flexion axis in the sensors' frames, roughly: fixes the common sign of the axes (as in the estimators)",
+            "Flexion axis in the sensors' frames, roughly: fixes the common sign of the axes (as in the estimators); "
+            "empty: not stated",
             source="source: x",
         ),
-    ] = "x"
+    ] = ""
     up: Annotated[str, meta("Long axis in the sensors' frames, where there is no standing pose")] = ""
     sd_gyr: Annotated[float, meta("Misfit of the rates across the axes", "rad/s", "ours", gt=0.0)] = 0.05
     sd_acc: Annotated[
@@ -79,9 +80,10 @@ class JointCalibrator(Calibrator):
 
     Values: ``hinges``, one per pair of neighbouring segments (``joint``, ``segments``, ``axes`` in both sensors'
     frames, ``axes_sd_deg``, ``positions_m`` from the joint's centre to each sensor, ``position_sd_m``, ``pairing``,
-    ``gyr_bias_rad_s``, ``acc_bias_m_s2``, ``biases_bounded``, ``mean_force_m_s2``, ``skewness``,
-    ``long_axes_guessed``, ``usable``, ``why``), and ``rot_sb_<segment>``, the rotation from the sensor's to the
-    segment's frame (x flexion axis, z long axis upwards, y = z × x), row by row.
+    ``gyr_bias_rad_s``, ``acc_bias_m_s2``, ``biases_bounded``, ``skewness``, ``sign_by``
+    (stated, swings, nothing), ``long_axes``, ``long_axes_guessed``, ``usable``, ``why``), and
+    ``rot_sb_<segment>``, the rotation from the sensor's to the segment's frame (x flexion axis, z long axis upwards,
+    y = z × x), row by row.
     """
 
     name: ClassVar[str] = "joint"
@@ -103,7 +105,8 @@ class JointCalibrator(Calibrator):
         standing = [bool(p.static) and p.static in one.label for one in stretches]
         moving = [s for s, still in zip(spans, standing, strict=True) if not still] or spans
         pairs = list(pairwise(segments))
-        hinges = [self.hinge(a, b, moving) for a, b in pairs] if p.method == "hinge" else []
+        stated = {s: any(states_axis(p, s, one.channels) for one in stretches) for s in segments}
+        hinges = [self.hinge(a, b, moving, stated) for a, b in pairs] if p.method == "hinge" else []
         axes: dict[str, FloatArray] = {}
         remarks: list[str] = []
         for hinge in hinges:
@@ -128,7 +131,7 @@ class JointCalibrator(Calibrator):
             elif p.method == "static":
                 axes[segment] = vector(per_segment(p.axis, segment) or "x", "axis")
         poses = [span for span, still in zip(spans, standing, strict=True) if still]
-        ups = self.long_axes(hinges, remarks, {s for s in axes if any(s in pose for pose in poses)})
+        ups = self.long_axes(hinges, remarks, {s for s in axes if any(s in pose for pose in poses)}, stated)
         values: dict[str, Any] = {}
         if hinges:
             values["hinges"] = [{k: v for k, v in h.items() if k != "cov"} for h in hinges if h["usable"]]
@@ -147,7 +150,9 @@ class JointCalibrator(Calibrator):
             usable=bool(axes),
         )
 
-    def hinge(self, upper: str, lower: str, spans: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    def hinge(
+        self, upper: str, lower: str, spans: Sequence[dict[str, Any]], stated: Mapping[str, bool]
+    ) -> dict[str, Any]:
         """Return axes, position and verdict of the joint between two segments."""
         p = self.params
         joint = joint_name(upper, lower)
@@ -167,10 +172,15 @@ class JointCalibrator(Calibrator):
         handedness.look_through(judged[0], rows, 1.0 / rate)
         step = max(1, math.ceil(len(rows) / MOST_ROWS))
         rows = np.ascontiguousarray(rows[::step])
-        work = np.zeros(1, axisfit.WORK_DTYPE)
+        work = np.zeros(1, mounting.RECORD)
         w = work[0]
         for i, segment in enumerate((upper, lower)):
-            w["axis"][i] = vector(per_segment(p.axis, segment) or "x", "axis")
+            mount = given_mount(p, segment)
+            w["axis"][i] = w["given_axis"][i] = mount[0]
+            w["given_up"][i] = mount[2]
+            w["stated"][i], w["up_stated"][i] = stated[segment], bool(per_segment(p.up, segment))
+        w["below"] = 1.0, 0.0 if lower == "foot" else -1.0
+        w["is_knee"] = joint == "knee"
         hint = w["axis"].copy()
         lag = max(1, round(0.3 * rate / step))
         paired = False
@@ -197,18 +207,14 @@ class JointCalibrator(Calibrator):
         stretches = unbroken([(s[upper], s[lower]) for s in spans if upper in s and lower in s])
         if p.band_hz > 0.0 and stretches:
             best = vectorfit.fit(stretches, best.axes, p.band_hz, p.sd_gyr, p.sd_acc)
-        w["axis"] = best.axes
-        skew = skewness(work[0], rows, len(rows), lag)
         if w["pairing"] < hingefit.DOUBTFUL:
             few = np.ascontiguousarray(rows[:: max(1, len(rows) // 1000)])
             short = max(1, round(lag * len(few) / len(rows)))
-            again = np.zeros(1, axisfit.WORK_DTYPE)
-            again[0]["axis"] = hint
-            hingefit.find_hand(again[0], few, len(few), short, p.sd_gyr, p.sd_acc, p.gravity)
-            w["hand"] = again[0]["hand"]
+            w["hand"] = handedness.hand_of_pair(few, short, p.gravity)
         mirrored = handedness.left_handed_of(judged[0], (upper, lower), int(w["hand"]))
-        sign = self.sign(upper, joint, best.axes[0], skew)
-        best = best._replace(axes=sign * best.axes)
+        w["axis"], w["pos"], w["pos_sd"] = best.axes, best.positions, best.position_sd
+        mounting.orient(work[0], rows, len(rows), lag)
+        best = best._replace(axes=w["axis"].copy())
         sd = np.degrees(best.axes_sd)
         still = [n for n, r in zip((upper, lower), w["rate_rms"], strict=True) if r <= 0.05]
         why = ""
@@ -235,27 +241,16 @@ class JointCalibrator(Calibrator):
             "gyr_bias_rad_s": best.biases.tolist(),
             "acc_bias_m_s2": best.acc_biases.tolist(),
             "biases_bounded": best.bounded,
-            "mean_force_m_s2": [
-                rows[:, axisfit.ACC + b : axisfit.ACC + b + 3].mean(axis=0).tolist()
-                for b in (0, axisfit.WIDTH)
-            ],
-            "skewness": sign * skew,
+            "skewness": float(w["skew"]),
+            "sign_by": mounting.SIGNS[int(w["sign_by"])],
+            "long_axes": w["up"].tolist(),
+            "long_axes_guessed": [bool(g) for g in w["guessed"]],
             "samples": len(rows),
             "cov": {
                 f"axis_{joint}_{segment}": best.axes_cov[i].tolist()
                 for i, segment in enumerate((upper, lower))
             },
         }
-
-    def sign(self, upper: str, joint: str, axis: FloatArray, skew: float) -> float:
-        """Return the common sign of both axes, from the upper one (3,).
-
-        It is the parameter's; where that lies far off, that of a knee's swings.
-        """
-        along = float(axis @ given_mount(self.params, upper)[0])
-        if abs(along) < NEAR and joint == "knee" and abs(skew) > SKEWED:
-            return 1.0 if skew > 0.0 else -1.0
-        return -1.0 if along < 0.0 else 1.0
 
     def functional(self, segment: str, spans: Sequence[dict[str, Any]]) -> tuple[FloatArray, float]:
         """Return the main direction of a segment's rate and its spread in degrees."""
@@ -272,7 +267,11 @@ class JointCalibrator(Calibrator):
         return axis, float(np.degrees(math.atan(math.sqrt(power[1] / power[2] / count))))
 
     def long_axes(
-        self, hinges: Sequence[dict[str, Any]], remarks: list[str], stood: Collection[str]
+        self,
+        hinges: Sequence[dict[str, Any]],
+        remarks: list[str],
+        stood: Collection[str],
+        stated: Mapping[str, bool],
     ) -> dict[str, FloatArray]:
         """Return the long axes of both segments of every usable hinge, and remark what is guessed."""
         long: dict[str, FloatArray] = {}
@@ -280,21 +279,19 @@ class JointCalibrator(Calibrator):
             if not hinge["usable"]:
                 continue
             pair = hinge["segments"]
-            up = np.zeros((2, 3))
-            mounts = [given_mount(self.params, s) for s in pair]
-            guessed = [
-                bool(long_axis(np.array(a), mount[0], mount[2], np.array(f), u))
-                for mount, a, f, u in zip(mounts, hinge["axes"], hinge["mean_force_m_s2"], up, strict=True)
+            hinge["long_axes_guessed"] = [
+                g and s not in stood for g, s in zip(hinge["long_axes_guessed"], pair, strict=True)
             ]
-            hinge["long_axes_guessed"] = [g and s not in stood for g, s in zip(guessed, pair, strict=True)]
-            for segment, one, guess in zip(pair, up, guessed, strict=True):
+            for segment, up in zip(pair, hinge["long_axes"], strict=True):
                 if segment not in long or hinge["joint"] == "knee":
-                    long[segment] = one
-                if guess and segment not in stood:
-                    remarks.append(
-                        f"{segment}: its axis lies more than 45° off axis={self.params.axis}: zero and sign of the "
-                        f"angle are guesses (long axis ± {GUESS_DEG:.0f}°); give axis and up, or stand in a static span"
-                    )
+                    long[segment] = np.array(up)
+            about = {
+                "guessed": hinge["long_axes_guessed"],
+                "sign_by": mounting.SIGNS.index(hinge["sign_by"]),
+                "stated": [stated[s] for s in pair],
+                "skew": hinge["skewness"],
+            }
+            remarks += [r.detail for r in mounting.guess_remarks(about, pair)]
         return long
 
     def standing(

@@ -27,7 +27,7 @@ import numpy as np
 from ..contract import FloatArray
 from ..numerics.compiled import compiled
 from . import merge, selfaligned
-from .chain_zero import spread_of_zero
+from .chain_zero import axis_unknown, spread_of_zero
 from .selfaligned import near
 
 HINGE, TWO, FREE = 0, 1, 2
@@ -144,9 +144,34 @@ def square(s: Any, i: int) -> None:
 
 
 @compiled
+def face(s: Any, i: int) -> None:
+    """Turn segment ``i`` about the vertical so that its joint's axis has the heading that its neighbour says."""
+    other = i - 1 if i > 0 else 1
+    k = min(i, other)
+    if s.valid[other] == 0 or s.type[k] == TWO:
+        return
+    mine, its = (0, 1) if i == k else (1, 0)
+    r, wx, wy, vx, vy = s.rot, 0.0, 0.0, 0.0, 0.0
+    for m in range(3):
+        wx += r[other, 0, m] * s.j[k, its, m]
+        wy += r[other, 1, m] * s.j[k, its, m]
+        vx += r[i, 0, m] * s.j[k, mine, m]
+        vy += r[i, 1, m] * s.j[k, mine, m]
+    turn(s, i, 0.0, 0.0, math.atan2(vx * wy - vy * wx, vx * wx + vy * wy), False)
+
+
+@compiled
+def forget(s: Any, first: int, count: int) -> None:
+    """Set rows and columns of P from state ``first`` on to zero."""
+    for a in range(first, first + count):
+        for b in range(6 * s.n):
+            s.P[a, b] = 0.0
+            s.P[b, a] = 0.0
+
+
+@compiled
 def restart(s: Any, i: int) -> None:
     """Begin segment ``i``: tilt by its accelerometer, flexion axis along x (or the neighbour's) of the frame."""
-    n = 6 * s.n
     a = s.acc[i]
     size = math.sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
     ux, uy, uz = s.mount[i, 2, 0], s.mount[i, 2, 1], s.mount[i, 2, 2]
@@ -168,22 +193,9 @@ def restart(s: Any, i: int) -> None:
     r[i, first, 0], r[i, first, 1], r[i, first, 2] = jx, jy, jz
     r[i, 1 - first, 0], r[i, 1 - first, 1], r[i, 1 - first, 2] = sign * kx, sign * ky, sign * kz
     r[i, 2, 0], r[i, 2, 1], r[i, 2, 2] = ux, uy, uz
-    other = i - 1 if i > 0 else 1
-    if s.on_line == 1 and s.n > 1 and s.valid[other] == 1 and s.type[min(i, other)] != TWO:
-        # Heading of the joint's axis from the neighbour.
-        k = min(i, other)
-        mine, its = (0, 1) if i == k else (1, 0)
-        wx, wy, vx, vy = 0.0, 0.0, 0.0, 0.0
-        for m in range(3):
-            wx += r[other, 0, m] * s.j[k, its, m]
-            wy += r[other, 1, m] * s.j[k, its, m]
-            vx += r[i, 0, m] * s.j[k, mine, m]
-            vy += r[i, 1, m] * s.j[k, mine, m]
-        turn(s, i, 0.0, 0.0, math.atan2(vx * wy - vy * wx, vx * wx + vy * wy), False)
-    for a0 in range(6 * i, 6 * i + 6):
-        for b0 in range(n):
-            s.P[a0, b0] = 0.0
-            s.P[b0, a0] = 0.0
+    if s.on_line == 1 and s.n > 1:
+        face(s, i)
+    forget(s, 6 * i, 6)
     for k in range(3):
         s.P[6 * i + k, 6 * i + k] = 0.02
         s.P[6 * i + 3 + k, 6 * i + 3 + k] = s.p_bias
@@ -312,7 +324,7 @@ def connect(s: Any, j: int) -> None:
             s.misfit[j] += (s.two_tau * e * e / (r * max(1e-4, s.dt)) - s.misfit[j]) / s.misfits[j]
             take(s, 6, e, r)
     r = s.r_sway / max(1e-4, s.dt)
-    if s.type[j] == FREE:
+    if s.type[j] == FREE or axis_unknown(s):
         return
     a, b = s.j[j, 0], s.j[j, 1]
     to_nav(s, j, a[0], a[1], a[2], s.u)
@@ -428,6 +440,17 @@ def set_axes(s: Any) -> None:
 
 
 @compiled
+def begin_anew(s: Any) -> None:
+    """Take axes that are known from now on: until then both segments had their tilt, not their common heading."""
+    face(s, 1)
+    forget(s, 8, 1)
+    s.P[8, 8] = 0.1
+    s.zero_sum[0], s.zero_var[0], s.zero_count[0] = 0.0, 0.0, 0
+    if s.zero == 2:  # the encoder is there later too, the pose at the start is not
+        s.zero_time = 0.0
+
+
+@compiled
 def remember(s: Any) -> None:
     """Keep attitudes, biases and P before the measurements."""
     for i in range(s.n):
@@ -451,8 +474,13 @@ def step(s: Any) -> bool:
             restart(s, i)
         s.on_line = 1
         return True
-    if s.learn > 0 and s.n > 1 and selfaligned.watch(s) and s.known == 1:
+    unknown = axis_unknown(s)
+    if unknown:
+        s.angle[0, 0] = 0.0  # whole turns about no axis are not counted
+    if s.learn > 0 and s.n > 1 and selfaligned.watch(s) and (s.known == 1 or unknown) and not axis_unknown(s):
         set_axes(s)
+        if unknown:
+            begin_anew(s)
     predict(s)
     for i in range(s.n):
         if s.valid[i] == 1 and s.gap[i] > 0.0:

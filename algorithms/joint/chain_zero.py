@@ -6,10 +6,12 @@ import math
 from typing import Any
 
 from ..numerics.compiled import compiled
-from .mounting import GUESS_DEG
+from .mounting import GUESS_DEG, NOTHING
 from .selfaligned import near
 
 GUESS = math.radians(GUESS_DEG)
+UNKNOWN = math.radians(60.0)
+"""Standard deviation of a flexion, each segment, about an axis that is neither stated nor yet found."""
 
 
 @compiled
@@ -34,7 +36,26 @@ def stated_sd(s: Any, j: int) -> float:
     """Return the standard deviation of flexion ``j`` with what does not change with time: zero and accelerometers."""
     scale = innovation_scale(s, j)
     zero = s.mount_var if s.zero == 0 or s.zero_count[j] == 0 else scale * s.zero_var[j] / s.zero_count[j]
-    return math.sqrt(scale * s.angle_sd[j] ** 2 + zero + s.tilt_var)
+    angle = s.angle[j, 0] - s.zero_sum[j] / max(1, s.zero_count[j])
+    return math.sqrt(scale * s.angle_sd[j] ** 2 + zero + s.tilt_var + axis_var(s, angle))
+
+
+@compiled
+def axis_unknown(s: Any) -> bool:
+    """Return whether the hinge's axis is neither stated nor found (of a chain of joints: never)."""
+    return s.guessed[0] == 2 or s.guessed[1] == 2
+
+
+@compiled
+def axis_var(s: Any, angle: float) -> float:
+    """Return the variance of ``angle`` from an axis that is not known well, or of unknown sign (truth ±angle).
+
+    A stated axis that was not found is worth what the sensors turn about it: nothing is added on a robot's plain hinge.
+    """
+    if axis_unknown(s):
+        return 2.0 * UNKNOWN * UNKNOWN
+    loose = (2.0 - s.about[0] - s.about[1]) * GUESS * GUESS
+    return loose + (2.0 * angle * angle if s.sign_by == NOTHING else 0.0)
 
 
 @compiled

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 import numpy as np
 
-from ..contract import ALL_COLUMNS, AlgorithmError, Context, FloatArray, Input, KernelEstimator, Remark
+from ..contract import (
+    ALL_COLUMNS,
+    AlgorithmError,
+    ChannelInfo,
+    Context,
+    FloatArray,
+    Input,
+    KernelEstimator,
+    Remark,
+)
 from ..parameters import meta
 from . import handedness, merge
 from .merge import ENCODER, JOINTS, SEGMENTS
@@ -56,10 +65,11 @@ class MergeParams(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         str,
         meta(
             "Flexion axis in the frame of every sensor: x, -x, y … or three numbers; per segment after its name "
-            "(thigh=x shank=-y). A joint calibration goes before it",
+            "(thigh=x shank=-y). Empty: not stated; x is taken, and of a hinge that is found what the sensors show. A "
+            "joint calibration goes before it",
             source="source: x",
         ),
-    ] = "x"
+    ] = ""
     up: Annotated[
         str,
         meta(
@@ -132,6 +142,12 @@ def given_mount(params: Any, segment: str) -> FloatArray:
     axis = vector(per_segment(params.axis, segment) or "x", "axis")
     up = per_segment(params.up, segment)
     return mount_of(axis, vector(up, "up") if up else None)
+
+
+def states_axis(params: Any, segment: str, channels: Mapping[str, Sequence[ChannelInfo]]) -> bool:
+    """Return whether the parameter ``axis``, or the recording (axes = segment), says how a sensor's axes lie."""
+    in_segment = any(c.metadata.get("axes") == "segment" for c in channels.get(segment, ()))
+    return in_segment or bool(per_segment(params.axis, segment))
 
 
 def joint_name(upper: str, lower: str) -> str:
@@ -287,6 +303,7 @@ class JointEstimator(KernelEstimator):
                 )
         hand = int(s["hand"]) if "hand" in (self.dtype.names or ()) else 0
         mirrored = handedness.left_handed_of(s, self.segments, hand)
+        mirrored = mirrored or handedness.left_handed_neighbours(s, self.segments, self.params.gravity)
         if mirrored:
             remarks.append(mirrored_remark(mirrored))
         streams: Mapping[int, str] = {**dict(enumerate(self.segments)), ENCODER: "encoder"}

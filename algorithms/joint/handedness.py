@@ -7,7 +7,7 @@ changes its sign under a reflection. Both are tried: over windows of :data:`WIND
 o is found by least squares over all windows (a swinging lever may hide gravity's turn), and what is left is compared.
 
 Fast walking decides little (what is left is the body's acceleration either way), slow movements decide it by far; in
-doubt nothing is said. Where two sensors span a hinge, :func:`.hingefit.find_hand` compares them as well.
+doubt nothing is said. Where two neighbouring sensors span a hinge, :func:`.hingefit.find_hand` compares them as well.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ..contract import FloatArray
 from ..numerics.compiled import compiled, inlined
 from ..numerics.records import record_type
 from ..numerics.rotations import turn_body
-from . import axisfit
+from . import axisfit, hingefit
 
 WINDOW_S = 2.0
 MOST_S = 60.0
@@ -36,7 +36,18 @@ LEAST_RMS = 0.7
 BETTER = 0.6
 """Left with the rate reversed, over left with it as it is, below which the axes are called left-handed."""
 
+SPACING_S, STORE = 0.05, 512
+"""Samples in motion that are kept for the comparison of neighbours: the first half minute."""
+LEAST_ROWS = 100
+STILL_RATE = 0.05
+"""Rate (rad/s) of all sensors below which a sample is not kept."""
+
 FIELDS: list[Any] = [
+    ("hand_rows", "f8", (STORE, 4 * axisfit.WIDTH)),
+    ("hand_valid", "i8", (STORE, 4)),
+    ("hand_kept", "i8"),
+    ("hand_wait", "f8"),
+    ("hand_turned", "f8", (4, 3)),
     ("hand_rot", "f8", (4, 2, 3, 3)),
     ("hand_time", "f8", (4,)),  # of the present window
     ("hand_count", "i8", (4,)),
@@ -150,6 +161,35 @@ def look(s: Any, i: int) -> None:
 
 
 @compiled
+def keep(s: Any) -> None:
+    """Keep the sample given out of all sensors, columns of :mod:`.axisfit`."""
+    k = s.hand_kept
+    if k == STORE:
+        return
+    moves = False
+    for i in range(s.n):
+        if s.valid[i] == 1:
+            size = 0.0
+            for m in range(3):
+                s.hand_turned[i, m] += s.turn[i, m]
+                size += s.gyr[i, m] ** 2
+            moves = moves or size > STILL_RATE * STILL_RATE
+    s.hand_wait += s.dt
+    if not moves or s.hand_wait < SPACING_S:
+        return
+    s.hand_wait = 0.0
+    for i in range(s.n):
+        s.hand_valid[k, i] = s.valid[i] * s.slope[i]
+        b = axisfit.WIDTH * i
+        for m in range(3):
+            s.hand_rows[k, b + axisfit.GYR + m] = s.gyr[i, m]
+            s.hand_rows[k, b + axisfit.ACC + m] = s.acc[i, m]
+            s.hand_rows[k, b + axisfit.DGYR + m] = s.dgyr[i, m]
+            s.hand_rows[k, b + axisfit.SUM + m] = s.hand_turned[i, m]
+    s.hand_kept = k + 1
+
+
+@compiled
 def look_through(s: Any, rows: FloatArray, dt: float) -> None:
     """Take all samples of two sensors, columns of :mod:`.axisfit`, ``dt`` apart."""
     s.dt = dt
@@ -183,6 +223,42 @@ def left_handed(s: Any, i: int) -> bool:
     """Return whether the axes of sensor ``i`` are left-handed, or its gyroscope's sign wrong."""
     plain, reversed_rate = left_over(s, i)
     return plain > LEAST_RMS and reversed_rate < BETTER * plain
+
+
+def hand_of_pair(rows: FloatArray, lag: int, gravity: float) -> int:
+    """Return which of two sensors are left-handed (a bit each), by the hinge between them; 0 where that is not shown.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (n, 24)
+        Samples in the order of time, columns of :mod:`.axisfit`.
+    lag : int
+        Rows that lie about 0.3 s apart.
+    gravity : float
+        m/s².
+    """
+    work = np.zeros(1, axisfit.WORK_DTYPE)
+    work[0]["axis"] = np.eye(3)[0]
+    about = rows, len(rows), lag, hingefit.SD_GYR, hingefit.SD_ACC, gravity
+    hingefit.fit(work[0], *about, True)
+    if work[0]["pairing"] < hingefit.DOUBTFUL:
+        hingefit.find_hand(work[0], *about)
+    return int(work[0]["hand"])
+
+
+def left_handed_neighbours(s: Any, segments: Sequence[str], gravity: float) -> list[str]:
+    """Return the segments whose sensors are left-handed by the joints with their neighbours, where these are hinges."""
+    names: list[str] = []
+    for i in range(len(segments) - 1):
+        good = s["hand_valid"][: s["hand_kept"], i : i + 2].all(axis=1)
+        if good.sum() >= LEAST_ROWS:
+            columns = slice(axisfit.WIDTH * i, axisfit.WIDTH * (i + 2))
+            rows = np.ascontiguousarray(s["hand_rows"][: s["hand_kept"], columns][good])
+            hand = hand_of_pair(rows, round(0.3 / SPACING_S), gravity)
+            names += [
+                name for j, name in enumerate(segments[i : i + 2]) if hand >> j & 1 and name not in names
+            ]
+    return names
 
 
 def left_handed_of(s: Any, segments: Sequence[str], hand: int) -> list[str]:

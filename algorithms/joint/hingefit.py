@@ -13,6 +13,10 @@ PAIRED = 0.55
 """Share of the worse pairing's misfit in both above which the axes' signs belong together."""
 DOUBTFUL = 0.7
 """The same, below which it is looked whether a sensor is mirrored."""
+SD_GYR, SD_ACC = 0.05, 0.5
+"""Misfits of rates across (rad/s) and forces along the axes (m/s²) where no parameter says them."""
+SHARP = 0.1
+"""Standard deviation of the axes (rad) above which that says nothing: a hip, or hardly any motion."""
 MIRRORED = 0.6
 """Misfit with a sensor's rates reversed, over that with the rates as they are, below which it is mirrored."""
 
@@ -77,7 +81,12 @@ def find_hand(
             continue
         if hand == 0:
             plain = misfit
-        elif misfit < least and misfit < MIRRORED * plain and w.pairing > PAIRED:
+        elif (
+            misfit < least
+            and misfit < MIRRORED * plain
+            and w.pairing > PAIRED
+            and max(w.axis_sd[0], w.axis_sd[1]) < SHARP
+        ):
             least = misfit
             w.hand = hand
     w.axis[0, 0], w.axis[0, 1], w.axis[0, 2] = x, y, z

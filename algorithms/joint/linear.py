@@ -335,16 +335,16 @@ def correct(s: Any) -> None:
 
 @compiled
 def align_mounts(s: Any) -> None:
-    """Turn both mountings so that their flexion axis is the identified one."""
+    """Turn both mountings to the identified axes and their long axes."""
     k = s.flex
     up = 2
     for i in range(2):
         dot, size = 0.0, 0.0
         for m in range(3):
-            dot += s.mount[i, up, m] * s.axis[i, m]
+            dot += s.up[i, m] * s.axis[i, m]
         for m in range(3):
             s.mount[i, k, m] = s.axis[i, m]
-            s.mount[i, up, m] -= dot * s.axis[i, m]
+            s.mount[i, up, m] = s.up[i, m] - dot * s.axis[i, m]
             size += s.mount[i, up, m] ** 2
         size = math.sqrt(size)
         for m in range(3):

@@ -240,6 +240,7 @@ def give(s: Any) -> bool:
                     s.dgyr[i, j] = (3.0 * s.gyr[i, j] - 4.0 * g1 + g2) / span
         if s.valid[i] == 1:
             handedness.look(s, i)
+    handedness.keep(s)
     return True
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from ..contract import FloatArray, Remark
 from ..numerics.compiled import compiled, inlined
+from ..numerics.records import record_type
 from . import axisfit
 
 NEAR = 0.7
@@ -17,47 +19,92 @@ SKEWED = 0.7
 """Skewness beyond which a knee's swings say which way it bends."""
 GUESS_DEG = 30.0
 """How well the mean direction of gravity stands for a segment's long axis, standing or walking."""
+ALIKE, OFTEN = 0.87, 0.25
+"""A long axis that is not stated is the convention's where the force is so near it (cosine, 30°) so often (share)."""
+MAINLY = 0.8
+"""Share of a sensor's squared rate about the convention's flexion axis above which it is taken where none is found."""
+STILL = 0.05
+"""Root mean square of a rate (rad/s) below which it says nothing."""
+STATED, SWINGS, NOTHING = 0, 1, 2
+SIGNS = ("stated", "swings", "nothing")
+"""What the sign of the axes is by."""
+
+FIELDS: list[Any] = [
+    ("given_axis", "f8", (2, 3)),
+    ("given_up", "f8", (2, 3)),
+    ("stated", "i8", (2,)),  # whether the user, the recording or a calibration says the flexion axis
+    ("up_stated", "i8", (2,)),
+    ("up", "f8", (2, 3)),  # the long axis of the segment in each sensor's frame
+    ("guessed", "i8", (2,)),  # how the long axis is known: 0 stated, 1 guessed, 2 not at all
+    ("mean_force", "f8", (3,)),
+    ("below", "f8", (2,)),  # 1 where the sensor sits above the joint, −1 below, 0 where that says nothing
+    ("is_knee", "i8"),
+    ("skew", "f8"),  # of the joint's swings
+    ("sign_by", "i8"),
+    (
+        "about",
+        "f8",
+        (2,),
+    ),  # share of each sensor's squared rate about the axis of the parameters; 1: axes are known
+]
+"""Fields of a packed record, beside those of :mod:`.axisfit`."""
+
+RECORD = record_type(*axisfit.WORK, *FIELDS)
 
 
 @compiled
-def long_axis(
-    axis: FloatArray, given_axis: FloatArray, given_up: FloatArray, force: FloatArray, up: FloatArray
-) -> bool:
-    """Write a sensor's long axis, upwards, to ``up``; return whether it is guessed.
+def force_across(s: Any, rows: FloatArray, count: int, i: int) -> float:
+    """Write the mean force across the axis to ``s.mean_force``; return how often it is near ``s.given_up`` (share)."""
+    often = 0
+    for m in range(3):
+        s.mean_force[m] = 0.0
+    for k in range(count):
+        f = rows[k, axisfit.WIDTH * i + axisfit.ACC : axisfit.WIDTH * i + axisfit.ACC + 3]
+        along = f[0] * s.axis[i, 0] + f[1] * s.axis[i, 1] + f[2] * s.axis[i, 2]
+        size, near = 1e-9, 0.0
+        for m in range(3):
+            across = f[m] - along * s.axis[i, m]
+            size += across * across
+            near += across * s.given_up[i, m]
+            s.mean_force[m] += across / count
+        often += 1 if near > ALIKE * math.sqrt(size) else 0
+    return often / count
 
-    Where the axis that was found lies far off the parameter's, this says nothing of the sensor: the mean force does, as
-    if the segment were upright on average.
 
-    Parameters
-    ----------
-    axis : ndarray, shape (3,)
-        Flexion axis that was found.
-    given_axis, given_up : ndarray, shape (3,)
-        Flexion axis and long axis as the parameters say.
-    force : ndarray, shape (3,)
-        Mean specific force of the sensor.
-    up : ndarray, shape (3,)
-        Written.
+@compiled
+def set_long_axes(s: Any, rows: FloatArray, count: int) -> None:
+    """Write the long axes, upwards, to ``s.up`` and whether they are guessed to ``s.guessed``.
+
+    What is stated is taken. Where the axis that was found lies far off the stated one, or nothing is stated and the
+    sensors contradict the convention, the mean force stands for it, as if the segment were upright on average.
     """
-    cosine, along, size = 0.0, 0.0, 0.0
-    for m in range(3):
-        cosine += axis[m] * given_axis[m]
-        along += force[m] * axis[m]
-    guessed = abs(cosine) < NEAR
-    least = 0
-    for m in range(3):
-        up[m] = force[m] - along * axis[m]
-        size += up[m] ** 2
-        if abs(axis[m]) < abs(axis[least]):
-            least = m
-    for m in range(3):
-        if not guessed:
-            up[m] = given_up[m]
-        elif size > 1.0:
-            up[m] /= math.sqrt(size)
-        else:
-            up[m] = 1.0 if m == least else 0.0
-    return guessed
+    for i in range(2):
+        near, beside = 0.0, 0.0
+        for m in range(3):
+            near += s.axis[i, m] * s.given_axis[i, m]
+            beside += s.axis[i, m] * s.given_up[i, m]
+        often = force_across(s, rows, count, i)
+        usual = abs(near) > NEAR and (s.stated[i] == 1 or often > OFTEN)
+        s.guessed[i] = 0 if (abs(beside) < 0.9 if s.up_stated[i] == 1 else usual) else 1
+        size, least = 0.0, 0
+        for m in range(3):
+            size += s.mean_force[m] ** 2
+            if abs(s.axis[i, m]) < abs(s.axis[i, least]):
+                least = m
+        for m in range(3):
+            if size > 1.0:
+                s.up[i, m] = s.mean_force[m] / math.sqrt(size)
+            else:
+                s.up[i, m] = 1.0 if m == least else 0.0
+    # One sensor that happens to lie by the convention beside one that does not proves nothing.
+    if s.guessed[0] == 1 or s.guessed[1] == 1:
+        for i in range(2):
+            if s.stated[i] == 0 and s.up_stated[i] == 0:
+                s.guessed[i] = 1
+    for i in range(2):
+        if s.guessed[i] == 0:
+            for m in range(3):
+                s.up[i, m] = s.given_up[i, m]
 
 
 @inlined
@@ -93,37 +140,116 @@ def skewness(w: Any, rows: FloatArray, count: int, lag: int) -> float:
 
 
 @compiled
-def orient(s: Any, lag: int) -> None:
-    """Set the long axes ``s.up`` (:func:`long_axis`), and the sign of axes that lie far off the given one."""
-    s.skew = skewness(s, s.rows, s.kept, lag)
-    far = 0.0
-    for m in range(3):
-        far += s.axis[0, m] * s.given_axis[0, m]
-    if s.is_knee == 1 and abs(far) < NEAR and s.skew < -SKEWED:
+def orient(s: Any, rows: FloatArray, count: int, lag: int) -> None:
+    """Set the common sign of the axes ``s.axis`` and what it is by, and the long axes ``s.up``.
+
+    A stated axis decides. Where none is stated a walking knee's swings do; else the sign is not known.
+    """
+    s.skew = skewness(s, rows, count, lag)
+    s.about[0], s.about[1] = 1.0, 1.0
+    near, default = 0.0, 0.0
+    for i in range(2):
+        dot = 0.0
+        for m in range(3):
+            dot += s.axis[i, m] * s.given_axis[i, m]
+        if s.stated[i] == 1 and abs(dot) > abs(near):
+            near = dot
+        if i == 0:
+            default = dot
+    shown, by = default, NOTHING
+    swings = s.skew if s.is_knee == 1 and abs(s.skew) > SKEWED else 0.0
+    if near != 0.0:
+        # Far off the stated axis its sign is taken, but believed only where the knee says the same.
+        shown, by = near, STATED if abs(near) > NEAR or near * swings > 0.0 else NOTHING
+    elif swings != 0.0:
+        shown, by = swings, SWINGS
+    s.sign_by = by
+    if shown < 0.0:
         s.skew = -s.skew
         for i in range(2):
             for m in range(3):
                 s.axis[i, m] = -s.axis[i, m]
+    set_long_axes(s, rows, count)
+
+
+@compiled
+def suppose(s: Any, rows: FloatArray, count: int, lag: int) -> None:
+    """Judge the axes of the parameters, in ``s.axis``, where none can be found.
+
+    Stated ones are taken, and ``s.about`` says how much each sensor turns about them. Others are where both sensors
+    turn mainly about them and gravity lies as by the convention; else the mounting is not known (``s.guessed`` 2).
+    """
+    stated = s.stated[0] == 1 and s.stated[1] == 1
+    if stated:
+        for i in range(2):
+            s.guessed[i] = 0
+            for m in range(3):
+                s.up[i, m] = s.given_up[i, m]
+    else:
+        orient(s, rows, count, lag)
+    usual = s.guessed[0] == 0 and s.guessed[1] == 0
     for i in range(2):
-        for m in range(3):
-            s.mean_force[m] = 0.0
-            for k in range(s.kept):
-                s.mean_force[m] += s.rows[k, axisfit.WIDTH * i + axisfit.ACC + m] / s.kept
-        s.guessed[i] = 1 if long_axis(s.axis[i], s.given_axis[i], s.given_up[i], s.mean_force, s.up[i]) else 0
+        about, total = 0.0, 1e-9
+        for k in range(count):
+            along = 0.0
+            for m in range(3):
+                rate = rows[k, axisfit.WIDTH * i + axisfit.GYR + m]
+                along += rate * s.axis[i, m]
+                total += rate * rate
+            about += along * along
+        s.about[i] = about / total if total > count * STILL * STILL else 1.0
+        usual = usual and (s.stated[i] == 1 or s.about[i] > MAINLY)
+    if not usual and not stated:
+        s.guessed[0], s.guessed[1] = 2, 2
 
 
-def mounting_remarks(s: Any, segments: tuple[str, ...]) -> list[Remark]:
-    """Say where what was found contradicts ``axis`` and ``up``, or where these say nothing of the sensors."""
+FAR, UNSTATED = "the axis found lies more than 45° off the stated one", "axis is not stated"
+
+
+def guess_remarks(s: Any, segments: Sequence[str], fatal: bool = False) -> list[Remark]:
+    """Say what of the mounting is guessed, and by what; ``fatal`` where the stated uncertainty does not hold it."""
     guessed = [n for n, g in zip(segments, s["guessed"], strict=False) if g]
+    by = int(s["sign_by"])
+    why = FAR if any(s["stated"]) else UNSTATED
+    if by == NOTHING:
+        return [
+            Remark(
+                "sign_unknown",
+                f"{' and '.join(segments[:2])}: {why}, and nothing measured says which way the joint bends: its angle "
+                "may have the wrong sign; give axis"
+                + (
+                    " and up: the long axes are guesses too"
+                    if guessed
+                    else " (the stated uncertainty holds both)"
+                ),
+                fatal=fatal or bool(guessed),
+            )
+        ]
     if guessed:
         return [
             Remark(
                 "mounting_guessed",
-                f"{' and '.join(guessed)}: the axis found lies more than 45° off the parameter axis: zero and sign of "
-                f"the angle are guesses (long axis ± {GUESS_DEG:.0f}°); give axis and up, or calibrate with a static "
-                "span",
+                f"{' and '.join(guessed)}: {why}: the long axis is a guess (± {GUESS_DEG:.0f}°)"
+                + (
+                    f", the sign of the knee that of its swings (skewness {s['skew']:.1f})"
+                    if by == SWINGS
+                    else ""
+                )
+                + "; give axis and up, or calibrate with a static span",
+                fatal=fatal,
             )
         ]
+    return []
+
+
+def mounting_remarks(s: Any, segments: tuple[str, ...], fatal: bool = False) -> list[Remark]:
+    """Say where what was found contradicts ``axis`` and ``up``, or where these say nothing of the sensors.
+
+    ``fatal`` where the stated uncertainty does not hold what is guessed.
+    """
+    remarks = guess_remarks(s, segments, fatal)
+    if remarks:
+        return remarks
     # Share of the long axis in the direction from the joint's centre, + where the sensor sits on the right side.
     sides = [
         side * float(o @ up) / max(1e-9, float(np.linalg.norm(o)))

@@ -152,7 +152,7 @@ class ChainEstimator(JointEstimator):
         s["misfit"], s["misfits"] = 1.0, chain.FIRST_MISFITS
         s["r_sway"] = 2.0 * np.radians(p.sway_deg) ** 2 * p.tau_sway
         s["r_rest"] = 2.0 * p.sd_rest**2 * 0.5
-        s["learn"], s["known"] = 0, 1
+        s["learn"], s["known"], s["about"] = 0, 1, 1.0
         for j in range(n - 1):
             s["j"][j] = s["mount"][j : j + 2, 0]
         self.set_up_joints(context)

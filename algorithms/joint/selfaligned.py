@@ -19,8 +19,8 @@ STILL_RATE = 0.05
 
 FIELDS: list[Any] = [
     *axisfit.WORK,
+    *mounting.FIELDS,
     ("base", "f8", (2, 2, 3)),  # x_i, y_i of eq 74 in each sensor's frame
-    ("up", "f8", (2, 3)),  # c of each sensor: the long axis of the segment
     ("rows", "f8", (STORE, axisfit.COLUMNS)),
     ("whole", "f8", (2, 3)),  # integral of each rate
     ("kept", "i8"),
@@ -34,13 +34,6 @@ FIELDS: list[Any] = [
     ("sd_gyr", "f8"),
     ("sd_acc", "f8"),
     ("gravity", "f8"),
-    ("given_axis", "f8", (2, 3)),
-    ("given_up", "f8", (2, 3)),
-    ("mean_force", "f8", (3,)),
-    ("below", "f8", (2,)),  # 1 where the sensor sits above the joint, −1 below, 0 where that says nothing
-    ("is_knee", "i8"),
-    ("guessed", "i8", (2,)),  # whether the long axis is guessed from the mean force
-    ("skew", "f8"),  # of the joint's swings
     # The angle.
     ("alpha_acc", "f8"),
     ("alpha_gyr", "f8"),
@@ -113,15 +106,15 @@ def identify(s: Any, lag: int) -> None:
     s.fits += 1
     if paired and s.hand == 0 and observable(s):
         s.known = 1
-        mounting.orient(s, lag)
+        mounting.orient(s, s.rows, n, lag)
     else:
         s.known = 0
+        reset_axes(s)
         for i in range(2):
             for m in range(3):
-                s.axis[i, m] = s.given_axis[i, m]
-                s.up[i, m] = s.given_up[i, m]
                 s.pos[i, m] = 0.0
-            s.guessed[i] = 0
+        s.pos_sd = 1.0
+        mounting.suppose(s, s.rows, n, lag)
 
 
 @compiled

@@ -14,8 +14,8 @@ from ..contract import AlgorithmError, Context, FloatArray, IntArray, Output, Re
 from ..parameters import meta
 from . import chain_smooth
 from .calibrate import JointCalibrationParams, JointCalibrator
-from .chain_zero import innovation_scale
-from .common import IMU_COLUMNS
+from .chain_zero import axis_var, innovation_scale
+from .common import IMU_COLUMNS, per_segment, states_axis
 from .mounting import mounting_remarks
 from .relative import ChainEstimator, HingeParams, JointHinge
 from .source import JOINT_STATE, NAMED, axis_remarks
@@ -139,7 +139,11 @@ class JointSmooth(ChainEstimator):
         p = self.params
         calibrator = JointCalibrator(
             JointCalibrationParams(
-                axis=p.axis,
+                axis=" ".join(
+                    f"{s}={per_segment(p.axis, s) or 'x'}"
+                    for s in self.segments
+                    if states_axis(p, s, self.context.channels)
+                ),
                 up=p.up,
                 sd_gyr=p.misfit_gyr,
                 sd_acc=p.misfit_acc,
@@ -198,7 +202,8 @@ class JointSmooth(ChainEstimator):
         else:
             off = 2 * np.pi * float(np.round(np.median(angles[:, 0]) / (2 * np.pi)))
         angles[:, 0] -= off
-        angles[:, 1] = np.sqrt(angles[:, 1] ** 2 + spread + s["tilt_var"])
+        unknown = np.array([axis_var(self.state[0], angle) for angle in angles[:, 0]])
+        angles[:, 1] = np.sqrt(angles[:, 1] ** 2 + spread + s["tilt_var"] + unknown)
 
     def snapshot(self) -> Any:
         """Return what was taken so far."""

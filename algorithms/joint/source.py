@@ -9,8 +9,8 @@ import numpy as np
 from ..contract import AlgorithmError, Context, Input, Output, Remark
 from ..parameters import meta
 from . import linear, linear_loop, selfaligned
-from .common import JointEstimator, MergeParams, encoder, imu, joint_name, mounts
-from .mounting import mounting_remarks
+from .common import JointEstimator, MergeParams, encoder, imu, joint_name, mounts, per_segment, states_axis
+from .mounting import NOTHING, SIGNS, guess_remarks, mounting_remarks
 
 TABLE5 = "table 5"
 AXES = ("roll", "pitch", "yaw")
@@ -395,12 +395,17 @@ def set_up_axes(
     s["given_axis"] = s["mount"][:2, flex]
     s["axis"] = s["given_axis"]
     s["up"] = s["given_up"] = s["mount"][:2, 2]
+    s["stated"] = [states_axis(p, name, context.channels) for name in segments[:2]]
+    s["up_stated"] = [bool(per_segment(p.up, name)) for name in segments[:2]]
     s["below"] = 1.0, 0.0 if segments[1] == "foot" else -1.0
     s["is_knee"] = joint_name(*segments[:2]) == "knee"
     s["learn"] = ("off", "axes", "position").index(p.identify)
     s["stride"], s["fit_at"] = 1, 2.0
     s["sd_gyr"], s["sd_acc"], s["gravity"] = sd_gyr, sd_acc, p.gravity
     s["known"] = s["learn"] == 0
+    s["about"] = 1.0
+    if s["learn"]:
+        s["guessed"] = np.where(s["stated"], 0, 2)
     calibration = context.calibrations.get("joint")
     if calibration is not None and calibration.usable and "hinges" in calibration.values:
         for hinge in calibration.values["hinges"]:
@@ -408,7 +413,9 @@ def set_up_axes(
                 s["axis"] = s["given_axis"] = np.array(hinge["axes"])
                 s["pos"] = np.array(hinge["positions_m"])
                 s["guessed"] = hinge.get("long_axes_guessed", [False, False])
-                s["pos_sd"], s["skew"] = hinge["position_sd_m"], hinge.get("skewness", 0.0)
+                s["sign_by"] = SIGNS.index(hinge.get("sign_by", SIGNS[0]))
+                s["pos_sd"] = hinge["position_sd_m"]
+                s["skew"] = hinge.get("skewness", 0.0)
                 s["learn"], s["known"] = 0, 1
     elif p.identify == "off" and calibration is not None and not calibration.usable:
         raise AlgorithmError(
@@ -418,9 +425,15 @@ def set_up_axes(
 
 
 def axis_remarks(s: Any, segments: tuple[str, ...], fatal: bool = True) -> list[Remark]:
-    """Say whether the identified axes may be used; ``fatal`` where nothing else gives the angle."""
+    """Say whether the identified axes may be used.
+
+    Where they may not, this is fatal if the mounting is not known either; with ``fatal`` always, and what is guessed is
+    too: nothing else gives the angle, and the stated uncertainty does not hold it.
+    """
     if s["learn"] == 0:
-        return []
+        return guess_remarks(s, segments, fatal) if s["sign_by"] == NOTHING else []
+    guess = fatal
+    fatal = fatal or bool((s["guessed"] == 2).any())
     if not s["fits"]:
         return [
             Remark("axis_unknown", "too short to find the hinge axes: at least 2 s of motion", fatal=fatal)
@@ -433,7 +446,7 @@ def axis_remarks(s: Any, segments: tuple[str, ...], fatal: bool = True) -> list[
                 f"hinge axes: {segments[0]} {np.round(s['axis'][0], 3).tolist()} ± {sd[0]:.1f}°, "
                 f"{segments[1]} {np.round(s['axis'][1], 3).tolist()} ± {sd[1]:.1f}°",
             ),
-            *mounting_remarks(s, segments),
+            *mounting_remarks(s, segments, guess),
         ]
     if s["hand"]:  # said by JointEstimator.remarks
         return []
@@ -446,10 +459,14 @@ def axis_remarks(s: Any, segments: tuple[str, ...], fatal: bool = True) -> list[
         else f"sd {sd[0]:.1f}° and {sd[1]:.1f}°, pairing {s['pairing']:.2f} of at least 0.55"
         + (" (each axis is plain, their signs are not: axis near the vertical?)" if max(sd) < 3.0 else "")
     )
+    if s["stated"].any():
+        shares = " and ".join(f"{100 * a:.0f} %" for a in s["about"])
+        why += f"; {shares} of the rotation is about the stated axes (the rest is in the stated uncertainty)"
     return [
         Remark(
             "not_observable",
             f"hinge axes are not observable: {why}; give them by axis, or calibrate on motion of both segments",
             fatal=fatal,
-        )
+        ),
+        *([] if fatal else guess_remarks(s, segments)),
     ]
