@@ -78,24 +78,6 @@ def test_a_mirrored_sensor_on_a_walker_is_seen_where_no_axes_are_looked_for(name
         assert remark.detail.startswith(f"{segment}:")
 
 
-@pytest.mark.parametrize("name", ["joint.relative", "joint.local", "joint.global", "joint.smp", "joint.sme"])
-def test_a_mirrored_sensor_on_a_walker_is_seen_where_no_axes_are_looked_for(name: str) -> None:
-    """By the joints with its neighbours: knee and ankle are hinges here, a hip is none and says nothing."""
-    segments = ("trunk", "thigh", "shank", "foot")
-    capture = leg("walking", seed=3, segments=segments, duration_s=20.0, mounting="random", soft_tissue=1.0)
-    t = np.round(capture.t * 1e9).astype(np.int64)
-    tables: Tables = {
-        s: {f"/leg/{s}/imu": table(capture.segments[s].acc_b, capture.segments[s].gyr_b, t)} for s in segments
-    }
-    if name in ("joint.smp", "joint.sme"):
-        tables["encoder"] = {"/e": pl.DataFrame({"t_ns": t, "knee": capture.joints["knee"].encoder})}
-    assert "sensor_mirrored" not in remarks(name, tables)
-    for segment in segments[1:]:
-        remark = remarks(name, mirrored(tables, (segment,)))["sensor_mirrored"]
-        assert remark.fatal
-        assert remark.detail.startswith(f"{segment}:")
-
-
 def test_calibration_refuses_a_mirrored_sensor() -> None:
     found = JointCalibrator().calibrate([stretch(mirrored(captured("walking", seed=3), ("shank",)))])
     assert not found.usable
