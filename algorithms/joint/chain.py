@@ -66,6 +66,7 @@ DTYPE = np.dtype(
         ("low", "f8", (MOST, 6)),  # mean force and rate over half a second
         ("smooth", "f8", (MOST, 3)),  # mean force over a fifth: a sensor's noise is no motion
         ("still", "f8", (MOST,)),
+        ("moved", "i8", (MOST,)),  # whether the segment moved since it began
         ("x", "f8", (STATES,)),
         ("P", "f8", (STATES, STATES)),
         ("at", "i8", (6,)),
@@ -202,7 +203,7 @@ def restart(s: Any, i: int) -> None:
         s.bias[i, k] = 0.0
     hinge = s.n > 1 and s.type[max(0, i - 1)] == HINGE
     s.P[6 * i + 2, 6 * i + 2] = 0.02 if hinge and level else 0.3
-    s.still[i] = 0.0
+    s.still[i], s.moved[i] = -0.5, 0  # the means begin with one sample each
     for k in range(3):
         s.smooth[i, k] = s.low[i, k] = s.acc[i, k]
         s.low[i, 3 + k] = s.gyr[i, k]
@@ -358,7 +359,12 @@ def rest(s: Any, i: int) -> None:
         s.low[i, k] += w * (s.acc[i, k] - s.low[i, k])
         s.low[i, 3 + k] += w * (s.gyr[i, k] - s.low[i, 3 + k])
         size += (s.low[i, 3 + k] - s.bias[i, k]) ** 2
-    steady = da < 0.09 and dg < 0.0012 and size < 0.0025 + 4.0 * s.p_bias
+    quiet = s.still[i] < 0.0 or (da < 0.09 and dg < 0.0012)
+    # Who has not moved yet stands; later a slow turn about the vertical, which no force shows, would be a bias.
+    most = 0.04 if s.moved[i] == 0 else 0.0025 + 4.0 * s.p_bias
+    steady = quiet and size < most
+    if s.still[i] >= 0.0 and (da > 0.36 or dg > 0.0012):  # four times the noise that may be taken for quiet
+        s.moved[i] = 1
     s.still[i] = s.still[i] + s.dt if steady else 0.0
     if s.still[i] < 1.0:
         return
