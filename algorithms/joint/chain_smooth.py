@@ -20,7 +20,8 @@ from ..numerics import cholesky
 from ..numerics.compiled import compiled
 from ..numerics.records import record_type
 from . import merge
-from .chain import measure_angles, square, step, turn
+from .chain import measure_angles, step
+from .chain_turn import square, turn
 
 N = 12
 """Error states of two segments."""
