@@ -8,6 +8,7 @@ from pathlib import Path
 import marcha.recording as mr
 import marcha.viz as viz
 import numpy as np
+import polars as pl
 import pytest
 from marcha.recording.errors import UsageError
 from marcha.replay import evaluate
@@ -70,6 +71,14 @@ def test_the_error_of_a_joint_is_to_the_reference_not_to_the_encoder(recs: dict[
     said = re.search(r"RMSE ([\d.]+)°", str(line.get_label()))
     assert said is not None
     assert float(said[1]) == pytest.approx(np.sqrt(np.mean(wrong**2)), abs=0.005)
+
+
+def test_a_joint_without_a_reference_has_no_empty_panel_of_errors(tmp_path: Path) -> None:
+    table = pl.DataFrame({"t_ns": np.arange(50) * 10**7, "knee": np.sin(np.arange(50) / 8.0)})
+    with mr.create(tmp_path / "a.mcap") as out:
+        out.add_table("/estimate/mine/joint", "sensor_msgs/msg/JointState", table)
+    (only,) = viz.figure(mr.open(tmp_path / "a.mcap"), kind="joints").axes
+    assert only.get_title(loc="left") == "knee angle"
 
 
 def test_the_distribution_ends_at_all_samples_and_states_its_quantiles(recs: dict[str, mr.Recording]) -> None:

@@ -314,7 +314,8 @@ def joints(rec: Recording, fig: Figure) -> None:
                 angles.setdefault(name, []).append(topic)
     estimated = {j for j, topics in angles.items() if any(is_estimate(t) for t in topics)}
     angles = {j: topics for j, topics in angles.items() if not estimated or j in estimated}
-    axes = iter(_rows(fig, len(angles) + len(estimated)))
+    judged = {j for j, topics in angles.items() if j in estimated and not all(map(is_estimate, topics))}
+    axes = iter(_rows(fig, len(angles) + len(judged)))
     for joint, topics in angles.items():
         ax = next(axes)
         curves: dict[str, Curve] = {}
@@ -327,13 +328,13 @@ def joints(rec: Recording, fig: Figure) -> None:
             ax.plot(_s(rec, table), values, color=_color(rec, topic), linewidth=1.1, label=_owner(topic))
         printed = printable(joint)
         _dress(ax, f"{printed} angle", TIME, "°")
-        if joint not in estimated:
+        if joint not in judged:
             continue
         below = next(axes)
-        truth = next((t for t in curves if not is_estimate(t)), None)
+        truth = next(t for t in curves if not is_estimate(t))
         widest = 1.0
-        for topic in [t for t in curves if is_estimate(t) and truth]:
-            t_ns, wrong = difference(curves[topic], curves[truth or ""])
+        for topic in filter(is_estimate, curves):
+            t_ns, wrong = difference(curves[topic], curves[truth])
             t, color = (t_ns - (rec.start_ns or 0)) / 1e9, _color(rec, topic)
             rmse = float(np.sqrt(np.mean(wrong**2))) if len(wrong) else np.nan
             widest = max(widest, 1.2 * float(np.percentile(np.abs(wrong), 99.5)) if len(wrong) else 0.0)
@@ -345,7 +346,7 @@ def joints(rec: Recording, fig: Figure) -> None:
                 below.fill_between(_s(rec, table), -sd, sd, color=color, alpha=0.2, linewidth=0)
                 widest = max(widest, 1.2 * float(np.nanmedian(sd)))
         below.set_ylim(-widest, widest)
-        _dress(below, f"{printed} error to {_owner(truth or 'no reference')} (area: ±1σ)", TIME, "°")
+        _dress(below, f"{printed} error to {_owner(truth)} (area: ±1σ)", TIME, "°")
 
 
 def jumps(rec: Recording, fig: Figure) -> None:
@@ -379,7 +380,8 @@ def cycles(rec: Recording, fig: Figure) -> None:
     ]
     if not results:
         raise UsageError(
-            f"{rec.path}: nothing for this figure: no joint angle with a reference over two cycles"
+            f"{rec.path}: nothing for this figure: no joint angle with a reference over two cycles; "
+            "without a reference: strides"
         )
     percent = np.arange(101)
     axes = _rows(fig, 2 * len(results))
