@@ -24,7 +24,7 @@ from marcha.recording.check import check
 from . import mcap, mutators, seeds, structures
 from .mutators import Mutated, Rng, pick
 from .seeds import Rows, Sample, Seeds
-from .server import Failure, restart_clock
+from .server import CPU_S, Failure, restart_clock
 
 MOST_CHARACTERS = 1200
 """Of a message."""
@@ -268,7 +268,7 @@ def _use(rng: Rng, folder: Path, path: Path) -> None:
         if arguments[0] in DRAWING:
             for module in ("marcha.viz.joint_figures", "matplotlib.backends.backend_agg", "scipy.signal"):
                 import_module(module)
-            restart_clock()
+            restart_clock(2 * CPU_S)  # a page of five figures takes 3 s of whatever recording
         command(folder, arguments, output)
     else:
         _export(rng, folder, path, str(pick(rng, sorted(available()))))
