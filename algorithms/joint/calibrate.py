@@ -172,16 +172,9 @@ class JointCalibrator(Calibrator):
         handedness.look_through(judged[0], rows, 1.0 / rate)
         step = max(1, math.ceil(len(rows) / MOST_ROWS))
         rows = np.ascontiguousarray(rows[::step])
-        work = np.zeros(1, mounting.RECORD)
+        work = np.zeros(1, axisfit.WORK_DTYPE)
         w = work[0]
-        for i, segment in enumerate((upper, lower)):
-            mount = given_mount(p, segment)
-            w["axis"][i] = w["given_axis"][i] = mount[0]
-            w["given_up"][i] = mount[2]
-            w["stated"][i], w["up_stated"][i] = stated[segment], bool(per_segment(p.up, segment))
-        w["below"] = 1.0, 0.0 if lower == "foot" else -1.0
-        w["is_knee"] = joint == "knee"
-        hint = w["axis"].copy()
+        hint = np.array([given_mount(p, segment)[0] for segment in (upper, lower)])
         lag = max(1, round(0.3 * rate / step))
         paired = False
         for _ in range(3):
@@ -212,9 +205,17 @@ class JointCalibrator(Calibrator):
             short = max(1, round(lag * len(few) / len(rows)))
             w["hand"] = handedness.hand_of_pair(few, short, p.gravity)
         mirrored = handedness.left_handed_of(judged[0], (upper, lower), int(w["hand"]))
-        w["axis"], w["pos"], w["pos_sd"] = best.axes, best.positions, best.position_sd
-        mounting.orient(work[0], rows, len(rows), lag)
-        best = best._replace(axes=w["axis"].copy())
+        oriented = np.zeros(1, mounting.RECORD)
+        o = oriented[0]
+        for i, segment in enumerate((upper, lower)):
+            mount = given_mount(p, segment)
+            o["given_axis"][i], o["given_up"][i] = mount[0], mount[2]
+            o["stated"][i], o["up_stated"][i] = stated[segment], bool(per_segment(p.up, segment))
+        o["below"] = 1.0, 0.0 if lower == "foot" else -1.0
+        o["is_knee"] = joint == "knee"
+        o["axis"], o["pos"], o["pos_sd"] = best.axes, best.positions, best.position_sd
+        mounting.orient(oriented[0], rows, len(rows), lag)
+        best = best._replace(axes=o["axis"].copy())
         sd = np.degrees(best.axes_sd)
         still = [n for n, r in zip((upper, lower), w["rate_rms"], strict=True) if r <= 0.05]
         why = ""
@@ -241,10 +242,10 @@ class JointCalibrator(Calibrator):
             "gyr_bias_rad_s": best.biases.tolist(),
             "acc_bias_m_s2": best.acc_biases.tolist(),
             "biases_bounded": best.bounded,
-            "skewness": float(w["skew"]),
-            "sign_by": mounting.SIGNS[int(w["sign_by"])],
-            "long_axes": w["up"].tolist(),
-            "long_axes_guessed": [bool(g) for g in w["guessed"]],
+            "skewness": float(o["skew"]),
+            "sign_by": mounting.SIGNS[int(o["sign_by"])],
+            "long_axes": o["up"].tolist(),
+            "long_axes_guessed": [bool(g) for g in o["guessed"]],
             "samples": len(rows),
             "cov": {
                 f"axis_{joint}_{segment}": best.axes_cov[i].tolist()
