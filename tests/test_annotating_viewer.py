@@ -26,8 +26,13 @@ from .test_viz_viewer import needs_vulkan
 S = 10**9
 PACE_S = 0.3
 """A hand is no faster; without graphics hardware the viewer draws a few pictures a second."""
+SLOW_S = 0.5
+"""A picture takes 0.2 s without graphics hardware; on a machine with other work a drag may be lost."""
 RULER = (790, 797, 783, 776, 804, 811)
 """Heights at which the time ruler of a window of 900 pixels is."""
+
+ELSEWHERE = tuple(range(832, 600, -7))
+"""Where it may be after a drag that pulled the panel's edge with it."""
 
 
 class Screen:
@@ -245,14 +250,20 @@ def _dragged(client: Any, picture: Path) -> tuple[int, int] | None:
         subprocess.run(["xdotool", *map(str, arguments)], check=True, capture_output=True)
         until, answers = time.monotonic() + PACE_S, 0
         while time.monotonic() < until or answers < 2:  # the second is of a picture begun after the movement
+            asked = time.monotonic()
             client.get_state()
+            waits.append(time.monotonic() - asked)
             answers += 1
 
-    until = time.monotonic() + 120
+    waits: list[float] = []
+    until, rounds = time.monotonic() + 150, 0
     while time.monotonic() < until:
+        rounds += 1
         # A drag before the first whole picture may pull the panel's edge away and the ruler with it.
         client.save_screenshot(str(picture))
-        for y in RULER:
+        for y in RULER if rounds == 1 else (*RULER, *ELSEWHERE):
+            if time.monotonic() > until:
+                break
             mouse("mousemove", 600, y)
             mouse("mousedown", 1)
             for x in (650, 700, 760, 800):
@@ -261,4 +272,7 @@ def _dragged(client: Any, picture: Path) -> tuple[int, int] | None:
             panel = client.get_blueprint(of="recording").blueprint["/time_panel"]["TimePanelBlueprint"]
             if panel.get("loop_mode") == "Selection":
                 return int(panel["time_selection"]["min"]), int(panel["time_selection"]["max"])
+    pace = sum(waits) / max(1, len(waits))
+    if pace > SLOW_S:
+        pytest.skip(f"the viewer draws a picture in {pace:.1f} s here: too slow to drag in")
     return None
