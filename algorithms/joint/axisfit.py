@@ -55,6 +55,17 @@ WORK: list[Any] = [
 
 
 @inlined
+def write_sample(s: Any, row: FloatArray, i: int, turned: FloatArray) -> None:
+    """Write the sample of sensor ``i`` that was given out, and the integral of its rate (3,), to a row of samples."""
+    b = WIDTH * i
+    for m in range(3):
+        row[b + GYR + m] = s.gyr[i, m]
+        row[b + ACC + m] = s.acc[i, m]
+        row[b + DGYR + m] = s.dgyr[i, m]
+        row[b + SUM + m] = turned[m]
+
+
+@inlined
 def huber(e: float, k: float) -> float:
     """Weight of residual ``e`` under Huber's loss with corner ``k``."""
     size = abs(e)

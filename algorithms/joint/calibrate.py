@@ -211,9 +211,8 @@ class JointCalibrator(Calibrator):
             mount = given_mount(p, segment)
             o["given_axis"][i], o["given_up"][i] = mount[0], mount[2]
             o["stated"][i], o["up_stated"][i] = stated[segment], bool(per_segment(p.up, segment))
-        o["below"] = 1.0, 0.0 if lower == "foot" else -1.0
         o["is_knee"] = joint == "knee"
-        o["axis"], o["pos"], o["pos_sd"] = best.axes, best.positions, best.position_sd
+        o["axis"] = best.axes
         mounting.orient(oriented[0], rows, len(rows), lag)
         best = best._replace(axes=o["axis"].copy())
         sd = np.degrees(best.axes_sd)

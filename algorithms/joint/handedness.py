@@ -180,12 +180,7 @@ def keep(s: Any) -> None:
     s.hand_wait = 0.0
     for i in range(s.n):
         s.hand_valid[k, i] = s.valid[i] * s.slope[i]
-        b = axisfit.WIDTH * i
-        for m in range(3):
-            s.hand_rows[k, b + axisfit.GYR + m] = s.gyr[i, m]
-            s.hand_rows[k, b + axisfit.ACC + m] = s.acc[i, m]
-            s.hand_rows[k, b + axisfit.DGYR + m] = s.dgyr[i, m]
-            s.hand_rows[k, b + axisfit.SUM + m] = s.hand_turned[i, m]
+        axisfit.write_sample(s, s.hand_rows[k], i, s.hand_turned[i])
     s.hand_kept = k + 1
 
 

@@ -41,15 +41,13 @@ FIELDS: list[Any] = [
     ("is_knee", "i8"),
     ("skew", "f8"),  # of the joint's swings
     ("sign_by", "i8"),
-    (
-        "about",
-        "f8",
-        (2,),
-    ),  # share of each sensor's squared rate about the axis of the parameters; 1: axes are known
+    # Share of each sensor's squared rate about the axis of the parameters; 1: axes are known.
+    ("about", "f8", (2,)),
 ]
 """Fields of a packed record, beside those of :mod:`.axisfit`."""
 
-RECORD = record_type(*axisfit.WORK, *FIELDS)
+RECORD = record_type(("axis", "f8", (2, 3)), *FIELDS)
+"""What :func:`orient` reads and writes."""
 
 
 @compiled

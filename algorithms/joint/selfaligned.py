@@ -150,12 +150,7 @@ def watch(s: Any) -> bool:
     s.skip = 0
     k = s.kept
     for i in range(2):
-        b = axisfit.WIDTH * i
-        for m in range(3):
-            s.rows[k, b + axisfit.GYR + m] = s.gyr[i, m]
-            s.rows[k, b + axisfit.ACC + m] = s.acc[i, m]
-            s.rows[k, b + axisfit.DGYR + m] = s.dgyr[i, m]
-            s.rows[k, b + axisfit.SUM + m] = s.whole[i, m]
+        axisfit.write_sample(s, s.rows[k], i, s.whole[i])
     s.kept = k + 1
     if s.kept == STORE:
         for k in range(STORE // 2):

@@ -202,7 +202,8 @@ class JointSmooth(ChainEstimator):
         else:
             off = 2 * np.pi * float(np.round(np.median(angles[:, 0]) / (2 * np.pi)))
         angles[:, 0] -= off
-        unknown = np.array([axis_var(self.state[0], angle) for angle in angles[:, 0]])
+        loose = axis_var(self.state[0], 0.0)  # it is a + b angle²
+        unknown = loose + (axis_var(self.state[0], 1.0) - loose) * angles[:, 0] ** 2
         angles[:, 1] = np.sqrt(angles[:, 1] ** 2 + spread + s["tilt_var"] + unknown)
 
     def snapshot(self) -> Any:
