@@ -210,7 +210,7 @@ import os, time
 from marcha.study.executors import Executor
 
 def wait(task):
-    os.write(1, b"begun\n")  # one write: two workers share the pipe, and print may write the end of the line by itself
+    os.write(1, b"begun\\n")  # one write: two workers share the pipe, and print may write the end of the line by itself
     time.sleep(60)
 
 if __name__ == "__main__":
