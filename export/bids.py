@@ -17,11 +17,12 @@ import polars as pl
 from ..recording import Recording
 from ..recording.errors import UsageError
 from ..recording.events import SIDECAR, TABLE, bids_events, events_text, sidecar, to_events
+from ..recording.names import free_name
 from ..recording.selection import Selection, selected_topics, within
 from ..recording.threads import Prefetch
 from .facts import origin, pretty
 from .folder import whole_folder
-from .tables import EVENT, free_name, meaning
+from .tables import EVENT, meaning
 
 VERSION = "1.9.0"
 ESTIMATE = "/estimate/"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -18,6 +17,7 @@ from ..recording import (
 )
 from ..recording.errors import MarchaError
 from ..recording.events import SIDECAR, TABLE
+from ..recording.names import free_name
 from ..recording.selection import Selection, selected_topics, within
 from .pointclouds import add_tracks
 from .rules import by_rules
@@ -87,7 +87,7 @@ class McapExporter:
                 if phases.height:
                     out.add_annotations(phases)
                 out.attach_events()
-            out.add_metadata(_free("export", rec.metadata), provenance(rec, options))
+            out.add_metadata(free_name("export", set(rec.metadata)), provenance(rec, options))
         return [path]
 
 
@@ -141,14 +141,6 @@ def _copy_part(rec: Recording, topics: list[str], options: McapOptions, out: Wri
     marks = within(rec.stored_annotations, options)
     if options.annotations and marks.height:
         out.add_annotations(marks)
-
-
-def _free(name: str, taken: Container[str]) -> str:
-    number, free = 1, name
-    while free in taken:
-        number += 1
-        free = f"{name}_{number}"
-    return free
 
 
 def provenance(rec: Recording, options: McapOptions) -> dict[str, str]:

@@ -208,12 +208,7 @@ def _file_names(topics: list[str], suffix: str) -> dict[str, str]:
     for topic in topics:
         stem = "".join(c if c.isalnum() or c in "-_." else "_" for c in topic.strip("/")) or "channel"
         stem = _short(stem if stem[0] != "." else f"_{stem}")
-        name, number = stem, 1
-        while name.lower() in taken:
-            number += 1
-            name = f"{stem}_{number}"
-        taken.add(name.lower())
-        names[topic] = name + suffix
+        names[topic] = free_path(stem, taken) + suffix
     return names
 
 
@@ -260,7 +255,7 @@ def _attachments(rec: Recording, folder: Path) -> list[str]:
     taken: set[str] = set()
     for attachment in rec.attachments:
         parts = [p for p in attachment.name.replace("\\", "/").split("/") if p not in ("", ".", "..")]
-        name = free_name("/".join(("attachments", *map(_short, parts or ["attachment"]))), taken)
+        name = free_path("/".join(("attachments", *map(_short, parts or ["attachment"]))), taken)
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(rec.attachment(attachment.name))
@@ -268,8 +263,11 @@ def _attachments(rec: Recording, folder: Path) -> list[str]:
     return written
 
 
-def free_name(name: str, taken: set[str]) -> str:
-    """Return a name that is no other's, nor the folder of another; both are reserved (``a`` and ``a/b``)."""
+def free_path(name: str, taken: set[str]) -> str:
+    """Return a path that is no other's, nor the folder of another (``a`` and ``a/b``), and reserve both.
+
+    File systems may take names that differ in case for one.
+    """
     free, number = name, 1
     while free.lower() in taken or f"{free.lower()}/" in taken or any(f in taken for f in _folders(free)):
         number += 1

@@ -16,6 +16,7 @@ from .errors import UsageError
 from .events import SIDECAR, TABLE, VOCABULARY
 from .files import require_other
 from .joins import JoinedPart, cut_history, history_text, joined_history
+from .names import free_name
 from .provenance import source_file
 from .reader import Recording
 from .schemas import SCHEMAS
@@ -90,7 +91,7 @@ def cut(rec: Recording, out: Path | str, start_ns: int, end_ns: int, *, overwrit
             if attachment.name not in _EVENTS:
                 file.add_attachment(attachment.name, rec.attachment(attachment.name), attachment.media_type)
         facts = {**_parent(rec), "start_ns": str(start_ns), "end_ns": str(end_ns)}
-        file.add_metadata(_free("cut", rec.metadata), facts)
+        file.add_metadata(free_name("cut", set(rec.metadata)), facts)
 
 
 def merge(
@@ -143,8 +144,7 @@ def merge(
         places: list[JoinedPart] = []
         vocabularies: dict[str, set[str]] = {}
         for number, (rec, offset, start) in enumerate(zip(recs, offsets, starts, strict=True), 1):
-            name = _free(rec.path.stem, taken)
-            taken.add(name)
+            name = free_name(rec.path.stem, taken)
             place = JoinedPart(rec, start, offset, name, ids)
             places.append(place)
             topics = [t for t in selected_topics(rec, Selection()) if rec.channels[t].schema != EVENT]
@@ -342,11 +342,3 @@ def _add_history(file: Writer, changes: list[Change]) -> None:
 def _parent(rec: Recording) -> dict[str, str]:
     source = source_file(rec.path)
     return {"source": source.name, "source_size": str(source.size), "source_blake2b": source.blake2b}
-
-
-def _free(name: str, taken: dict[str, dict[str, str]] | set[str]) -> str:
-    number, free = 1, name
-    while free in taken:
-        number += 1
-        free = f"{name}_{number}"
-    return free

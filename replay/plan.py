@@ -25,6 +25,7 @@ from ..algorithms.contract import (
     RowEstimator,
 )
 from ..recording.errors import Finding, UsageError
+from ..recording.names import free_name
 from .attachment import ChannelAttachment, NamedChannels, attach, device_of, serving
 from .calibrations import calibrations_of, usable
 from .messages import AttachedChannel
@@ -292,7 +293,7 @@ class _Planner:
                     return r
         parts = "_".join(p for p in _origin(primary).split("/") if p)
         wanted = f"{_identifier(maker.label or maker.name)}_{_identifier(parts)}"
-        run = _free(wanted, {*self.taken, *(r.run for r in self.runs)})
+        run = free_name(wanted, {*self.taken, *(r.run for r in self.runs)})
         if wanted in self.taken:
             detail = f"the recording has a run {wanted} already: this one is {run}"
             notes.append(Finding("renamed_run", 1, None, detail))
@@ -445,13 +446,6 @@ def _table_columns(output: Output) -> tuple[str, ...]:
 
 def _identifier(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_")
-
-
-def _free(run: str, taken: set[str]) -> str:
-    number, name = 2, run
-    while name in taken:
-        name, number = f"{run}_{number}", number + 1
-    return name
 
 
 @lru_cache(maxsize=256)
