@@ -165,7 +165,7 @@ def _run(argv: Sequence[str] | None) -> int:
         overview = not tokens or tokens[0].startswith("-")
         with warnings.catch_warnings():
             warnings.showwarning = warn
-            # NumPy's word of a damaged number that is too large to square says nothing to a user.
+            # As `overflow_unsaid` in the library, which would load NumPy: `marcha … --help` must answer at once.
             warnings.filterwarnings("ignore", r"(overflow|invalid value) encountered", RuntimeWarning)
             result = build(overview=overview)(tokens, exit_on_error=False, print_error=False)
         code = _finish(result, as_json=as_json)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from .server import PageServer
-from .session import Session
+from .session import Session, ended_by_keyboard
 from .video import video_of
 
 
@@ -49,10 +49,4 @@ def annotate_page(
             opened(server)
         if open_browser:
             webbrowser.open(server.address)
-        try:
-            server.wait()
-        except KeyboardInterrupt as ending:
-            if type(ending) is not KeyboardInterrupt:  # Ctrl-C ends a session, SIGTERM the program
-                raise
-            return True
-    return False
+        return ended_by_keyboard(server.wait)

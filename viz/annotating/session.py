@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import secrets
 import threading
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,20 @@ from ...recording.events import vocabularies
 
 Row = dict[str, Any]
 """One annotation: the columns of :data:`marcha.recording.annotations.COLUMNS`."""
+
+
+def ended_by_keyboard(work: Callable[..., object], *args: Any) -> bool:
+    """Let the user work by ``work(*args)``, and return whether Ctrl-C ended it.
+
+    Ctrl-C ends a session, SIGTERM the program: its exception, a kind of ``KeyboardInterrupt``, is raised.
+    """
+    try:
+        work(*args)
+    except KeyboardInterrupt as ending:
+        if type(ending) is not KeyboardInterrupt:
+            raise
+        return True
+    return False
 
 
 class Edit(msgspec.Struct, frozen=True):

@@ -9,7 +9,7 @@ from ...recording.errors import MarchaError
 from .. import viewer
 from ..timeaxis import SINCE_START, UTC, TimeAxis
 from .keys import Keys
-from .session import Edit, Session
+from .session import Edit, Session, ended_by_keyboard
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -255,19 +255,13 @@ def annotate_in_viewer(
     """
     import rerun as rr
 
-    from ..stream import finish, new_stream, release
+    from ..stream import new_stream, release
 
     with viewer.native(online=online) as window:
         stream = new_stream()
         stream.set_sinks(rr.GrpcSink(viewer.uri(window.port)))
         try:
-            _mark(session, stream, window, say, opened)
-            if window.running:
-                finish(stream)
-        except KeyboardInterrupt as ending:
-            if type(ending) is not KeyboardInterrupt:  # Ctrl-C ends a session, SIGTERM the program
-                raise
-            return True
+            return ended_by_keyboard(_mark, session, stream, window, say, opened)
         except RuntimeError:  # Rerun's thread towards the viewer is gone
             if window.running:
                 raise
@@ -284,11 +278,12 @@ def _mark(
     say: Callable[[str], object],
     opened: Callable[[Viewer], object] | None,
 ) -> None:
-    """Draw the recording and let the user mark in it."""
+    """Draw the recording and let the user mark in it, to the end of the viewer or the user's wish."""
     from rerun.experimental import ViewerClient
 
     from ..draw import draw
     from ..screenshot import PATIENCE_S, loaded
+    from ..stream import finish
 
     (scene,) = draw([session.rec], stream, annotating=True)
 
@@ -311,4 +306,6 @@ def _mark(
         while window.running:
             key = keys.next()
             if key is not None and not marker.press(key):
-                return
+                break
+    if window.running:
+        finish(stream)
