@@ -6,6 +6,8 @@ CSV is read in pieces and never held; JSON and SQLite are.
 from __future__ import annotations
 
 import contextlib
+import csv
+import io
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from itertools import islice
@@ -16,20 +18,28 @@ import msgspec
 import numpy as np
 import polars as pl
 
+from ..recording.codec import MAX_TIME_NS
 from ..recording.errors import MarchaError
+from ..recording.files import read_small
 from .columns import float_blocks, require_header
 from .contract import ReportBuilder
 from .text import start_of
 
 WANTED = "time,seconds_elapsed,z,y,x"
+_WANTED_TEXT = "time,seconds_elapsed,text,millisecond_press_duration"
 READ = (
     "Accelerometer", "TotalAcceleration", "Gravity", "AccelerometerUncalibrated", "Gyroscope",
     "GyroscopeUncalibrated", "Magnetometer", "MagnetometerUncalibrated", "Location", "LocationGps", "Barometer",
-    "Pedometer", "Orientation",
+    "Pedometer", "Orientation", "Annotation",
 )  # fmt: skip
 TRIPLES = READ[:8]
 """Tables of three axes."""
-_TEXT = ("sensor", "name", "text", "standardisation")
+ANNOTATION = "Annotation"
+"""Table of what the user wrote while the app recorded."""
+PRESS = "millisecond_press_duration"
+_TEXTS = ("text", PRESS)
+"""Columns that stay text, as it is written."""
+_NO_NUMBERS = ("sensor", "name", "standardisation")
 _NUMBERS = {
     "time", "seconds_elapsed", "x", "y", "z", "latitude", "longitude", "altitude", "horizontalAccuracy",
     "verticalAccuracy", "speed", "bearing", "pressure", "steps", "qw", "qx", "qy", "qz",
@@ -40,7 +50,7 @@ HEAD_BLOCKS = 2
 
 
 class SensorTable(NamedTuple):
-    """The rows of one sensor: ``t`` (ns), ``line``, numbers.
+    """The rows of one sensor: ``t`` (ns), ``line``, numbers, and what people wrote.
 
     Attributes
     ----------
@@ -77,11 +87,19 @@ def is_header(cells: Sequence[str]) -> bool:
 def read_tables(path: Path, report: ReportBuilder) -> tuple[Tables, dict[str, str]]:
     """Return what is read: a table a sensor, and the metadata."""
     if path.is_dir():
-        files, about = files_of(path), {}
-        for file in files:
+        about: dict[str, str] = {}
+        tables: dict[str, SensorTable | None] = {}
+        unread: list[str] = []
+        for file in files_of(path):
             if file.stem.lower() == "metadata":
                 about = _first_row(file)
-        tables = {f.stem: _csv(f, report) for f in files if f.stem in READ}
+            elif file.stem == ANNOTATION:
+                tables[ANNOTATION] = _annotations(file, report)
+            elif file.stem in READ:
+                tables[file.stem] = _csv(file, report)
+            else:
+                unread.append(file.name)
+        note_unread(unread, report)
         return {k: v for k, v in tables.items() if v is not None}, about
     head = start_of(path)
     if head.startswith(b"SQLite format 3\x00"):
@@ -95,12 +113,39 @@ def read_tables(path: Path, report: ReportBuilder) -> tuple[Tables, dict[str, st
     return ({name: table} if table is not None else {}), {}
 
 
+def note_unread(names: Sequence[str], report: ReportBuilder) -> None:
+    """Say which tables of an export no channel takes."""
+    report.note("unused_file", f"{', '.join(names)}: not imported", count=len(names), subject=" ".join(names))
+
+
 def _first_row(file: Path) -> dict[str, str]:
     try:
         rows = pl.read_csv(file, infer_schema=False, n_rows=1)
     except (OSError, pl.exceptions.PolarsError) as error:
         raise MarchaError(f"{file}: cannot be read: {str(error).splitlines()[0]}") from None
     return {k: v for k, v in rows.row(0, named=True).items() if v} if rows.height else {}
+
+
+def _annotations(file: Path, report: ReportBuilder) -> SensorTable | None:
+    """Read what people wrote: a text in quotes may go over several lines, which no table of numbers may."""
+    header = require_header(file, is_header, _WANTED_TEXT)
+    text = io.StringIO(read_small(file).decode("utf-8-sig", "replace"), newline="")
+    reader = csv.reader(text, delimiter=header.separator)
+    rows, lines = [], []
+    try:
+        for row in reader:
+            if len(row) == len(header.names) and reader.line_num > header.line:
+                rows.append(row)
+                lines.append(reader.line_num)
+            elif row and reader.line_num > header.line:
+                detail = f"{file.name}: {len(row)} of {len(header.names)} columns; row dropped"
+                report.drop("bad_row", detail, line=reader.line_num, subject=file.name)
+    except csv.Error as error:
+        raise MarchaError(f"{file}, line {reader.line_num}: {error}; repair the line") from None
+    if not rows:
+        return None
+    frame = _numbers(pl.DataFrame({n: [row[k] for row in rows] for k, n in enumerate(header.names) if n}))
+    return _held(ANNOTATION, frame.with_columns(line=pl.Series(lines)))
 
 
 def _csv(file: Path, report: ReportBuilder) -> SensorTable | None:
@@ -124,14 +169,17 @@ def _csv(file: Path, report: ReportBuilder) -> SensorTable | None:
 
 
 def _numbers(rows: pl.DataFrame) -> pl.DataFrame:
-    """Return a table of text as numbers; ``time`` whole."""
+    """Return a table of text as numbers, but for what people wrote; ``time`` whole."""
     t = rows["time"].cast(pl.String).cast(pl.Int64, strict=False)
-    others = [c for c in rows.columns if c not in ("time", *_TEXT)]
+    others = [c for c in rows.columns if c not in ("time", *_NO_NUMBERS)]
     table = rows.select(
-        pl.col(c).cast(pl.String).cast(pl.Float64, strict=False).fill_null(np.nan) for c in others
+        pl.col(c).cast(pl.String)
+        if c in _TEXTS
+        else pl.col(c).cast(pl.String).cast(pl.Float64, strict=False).fill_null(np.nan)
+        for c in others
     )
     line = pl.Series("line", np.arange(1, rows.height + 1))
-    return table.with_columns(t=t, line=line).drop_nulls("t")
+    return table.with_columns(t=t, line=line)
 
 
 def _json(path: Path) -> tuple[Tables, dict[str, str]]:
@@ -144,7 +192,7 @@ def _json(path: Path) -> tuple[Tables, dict[str, str]]:
         by_sensor.setdefault(str(row.get("sensor", "")), []).append(row)
     about = {k: str(v) for k, v in (by_sensor.get("Metadata") or [{}])[0].items()}
     tables = {k: pl.DataFrame(v, infer_schema_length=None) for k, v in by_sensor.items() if k in READ}
-    return {k: _held(_numbers(v)) for k, v in tables.items() if "time" in v.columns}, about
+    return {k: _held(k, _numbers(v)) for k, v in tables.items() if "time" in v.columns}, about
 
 
 def _sqlite(path: Path) -> tuple[Tables, dict[str, str]]:
@@ -163,16 +211,30 @@ def _sqlite(path: Path) -> tuple[Tables, dict[str, str]]:
                     about = {c: v for c, v in zip(columns, rows[0], strict=True) if v} if rows else {}
                 elif rows and "time" in columns:
                     data = dict(zip(columns, map(list, zip(*rows, strict=True)), strict=True))
-                    tables[name] = _held(
-                        _numbers(pl.DataFrame(data, schema=dict.fromkeys(columns, pl.String)))
-                    )
+                    texts = pl.DataFrame(data, schema=dict.fromkeys(columns, pl.String))
+                    tables[name] = _held(name, _numbers(texts))
     except sqlite3.Error as error:
         raise MarchaError(f"{path}: the database cannot be read: {error}") from None
     return tables, about
 
 
-def _held(frame: pl.DataFrame) -> SensorTable:
-    return SensorTable(frame, lambda report: iter([frame]), whole=True)
+def _held(name: str, frame: pl.DataFrame) -> SensorTable:
+    """Return a table that is in memory; rows whose time no recording can have are none."""
+    possible = frame["t"].is_between(0, MAX_TIME_NS).fill_null(value=False)
+    rows = frame.filter(possible)
+
+    def frames(report: ReportBuilder) -> Iterator[pl.DataFrame]:
+        if rows.height < frame.height:
+            report.drop(
+                "bad_row",
+                f"{name}: time is no whole number of nanoseconds from 1970 to 2038; row dropped",
+                count=frame.height - rows.height,
+                line=frame.filter(~possible)["line"][0],
+                subject=f"{name} time",
+            )
+        yield rows
+
+    return SensorTable(rows, frames, whole=True)
 
 
 def heads_of(*tables: SensorTable | None) -> list[pl.DataFrame | None]:

@@ -402,6 +402,12 @@ def sensor_logger(folder: Path, walk: PhoneWalk, platform: str = "android", stan
         "time,seconds_elapsed,verticalAccuracy,horizontalAccuracy,speed,bearing,altitude,longitude,latitude"
     )
     (folder / "Location.csv").write_text("\n".join([head, *rows, ""]))
+    notes = [
+        f'{walk.t_ns[100]},{elapsed[100]:.3f},"door, left",118',
+        f'{walk.t_ns[200]},{elapsed[200]:.3f},"two\nlines",95',
+    ]
+    head = "time,seconds_elapsed,text,millisecond_press_duration"
+    (folder / "Annotation.csv").write_text("\n".join([head, *notes, ""]))
     about = f"version,device name,platform,standardisation\n3,Phone,{platform},{str(standard).lower()}\n"
     (folder / "Metadata.csv").write_text(about)
     return folder

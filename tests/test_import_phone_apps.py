@@ -11,6 +11,7 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+import marcha.recording as mr
 import numpy as np
 import pytest
 from marcha.ingest import convert, recognise
@@ -194,6 +195,37 @@ def test_sensor_logger_in_one_file_is_the_same(tmp_path: Path, walk: PhoneWalk, 
     whole, single = convert(folder, tmp_path / "a.mcap"), convert(path, tmp_path / "b.mcap")
     assert whole.format == single.format == "sensor-logger"
     assert whole.channels == single.channels
+    first, second = (mr.open(tmp_path / name).annotations for name in ("a.mcap", "b.mcap"))
+    assert first.height == 2
+    assert first.equals(second)
+
+
+def test_sensor_logger_takes_what_the_user_wrote(tmp_path: Path, walk: PhoneWalk) -> None:
+    folder = samples.sensor_logger(tmp_path / "log", walk)
+    (folder / "Light.csv").write_text("time,seconds_elapsed,lux\n1,0.0,3\n")
+    with (folder / "Annotation.csv").open("a") as file:
+        file.write("soon,1.0,turn,80\n1,2\n4000000000000000000,3.0,turn,80\n")
+    done = convert(folder, tmp_path / "a.mcap")
+    findings = {(f.kind, f.count, f.first_line, f.detail.split(":")[0]) for f in done.report.findings}
+    assert findings >= {
+        ("bad_row", 1, 6, "Annotation.csv"),
+        ("bad_row", 2, 5, "Annotation"),
+        ("unused_file", 1, None, "Light.csv"),
+    }
+    marks = mr.open(tmp_path / "a.mcap").annotations
+    assert marks["label"].to_list() == ["door, left", "two\nlines"]
+    assert marks["start_ns"].to_list() == marks["end_ns"].to_list() == walk.t_ns[[100, 200]].tolist()
+    assert marks["metadata"][0] == '{"millisecond_press_duration":"118"}'
+    assert set(marks["tier"]) == {"events"}
+    assert set(marks["source"]) == {"human"}
+
+
+def test_sensor_logger_of_old_versions_has_no_press(tmp_path: Path, walk: PhoneWalk) -> None:
+    folder = samples.sensor_logger(tmp_path / "log", walk)
+    rows = f"time,seconds_elapsed,text\n{walk.t_ns[3]},0.3,standing\n{walk.t_ns[9]},0.9,\n"
+    (folder / "Annotation.csv").write_text(rows)
+    convert(folder, tmp_path / "a.mcap")
+    assert mr.open(tmp_path / "a.mcap").annotations["label"].to_list() == ["standing", ""]
 
 
 def test_sensor_logger_without_gravity_says_so(tmp_path: Path, walk: PhoneWalk) -> None:

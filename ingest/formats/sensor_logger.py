@@ -39,7 +39,18 @@ from ..phonelog import (
     require_rows,
     xyz,
 )
-from ..sensortables import TRIPLES, SensorTable, Tables, files_of, heads_of, is_header, read_tables
+from ..sensortables import (
+    ANNOTATION,
+    PRESS,
+    TRIPLES,
+    SensorTable,
+    Tables,
+    files_of,
+    heads_of,
+    is_header,
+    note_unread,
+    read_tables,
+)
 from ..text import start_of
 
 _Q = ("qw", "qx", "qy", "qz")
@@ -116,12 +127,14 @@ class SensorLogger:
                     else f"the magnetic field there and gravity have {'iOS' if turned else 'Android'}'s signs"
                 ),
             )
+        marks = tables.pop(ANNOTATION, None)
         streams, others = _streams(path, tables, turned, platform, report, attachments)
         return Import(
             channels=declared(s for s, _ in streams),
             blocks=_blocks(path, streams, others, report),
             report=report,
             attachments=attachments,
+            annotations=None if marks is None else _annotations(marks, report),
             metadata={
                 "device": {
                     "clock": "utc",
@@ -139,6 +152,23 @@ class SensorLogger:
                 }
             },
         )
+
+
+def _annotations(table: SensorTable, report: ReportBuilder) -> pl.DataFrame:
+    """Return what the user wrote while the app recorded, each at its instant.
+
+    How long the button was pressed is not how long the text holds: it stays a fact beside it.
+    """
+    rows = pl.concat(table.frames(report))
+    report.keep(rows.height)
+    return rows.select(
+        tier=pl.lit("events"),
+        start_ns="t",
+        end_ns="t",
+        label=pl.col("text").fill_null("") if "text" in rows.columns else pl.lit(""),
+        source=pl.lit("human"),
+        metadata=pl.struct(PRESS) if PRESS in rows.columns else pl.lit("{}"),
+    )
 
 
 def _turned_by_field(tables: Tables) -> bool | None:
@@ -175,7 +205,7 @@ def _streams(
     platform: str,
     report: ReportBuilder,
     attachments: list[SourceAttachment],
-) -> tuple[list[tuple[Stream, SensorTable]], list[SensorTable]]:
+) -> tuple[list[tuple[Stream, SensorTable]], Tables]:
     """Return the streams and what each is read from, and the tables of which none is made."""
     axes = ("x", "y", "z")
     sign = -1.0 if turned else 1.0
@@ -245,7 +275,7 @@ def _streams(
                 metadata={"north": north},
             )
             add([part], "Orientation", table.each(turn.frame))
-    return streams, list(left.values())
+    return streams, left
 
 
 class _Turn(NamedTuple):
@@ -381,12 +411,13 @@ def _scaled(table: SensorTable, factor: float) -> SensorTable:
 def _blocks(
     path: Path,
     streams: Sequence[tuple[Stream, SensorTable]],
-    others: Sequence[SensorTable],
+    others: Tables,
     report: ReportBuilder,
 ) -> Iterator[tuple[str, pl.DataFrame]]:
     for stream, table in streams:
         yield from stream.pull(table.frames(report))
-    for table in others:  # for what is wrong with them
+    for table in others.values():  # for what is wrong with them
         for _ in table.frames(report):
             pass
+    note_unread(list(others), report)
     require_rows(path, [s for s, _ in streams])
