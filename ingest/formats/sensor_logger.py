@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -53,6 +53,10 @@ from ..sensortables import (
 )
 from ..text import start_of
 
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+_XYZ = ("x", "y", "z")
 _Q = ("qw", "qx", "qy", "qz")
 _AGREES, _CLEARER = np.radians(20.0), np.radians(60.0)
 """An orientation is believed whose vertical lies as near to the measured force, in the median; and the other
@@ -108,27 +112,9 @@ class SensorLogger:
         report = ReportBuilder()
         attachments: list[SourceAttachment] = []
         tables, about = read_tables(path, report)
-        platform = options.platform or about.get("platform", "").lower()
-        stated = about.get("standardisation", "").lower()
-        standard = (
-            options.standardised if options.standardised is not None else stated in ("true", "1", "yes")
-        )
-        turned = platform == "ios" and not standard
-        if platform not in ("android", "ios"):
-            seen = _turned_by_field(tables)
-            turned = bool(seen)
-            platform = "ios" if turned else "android"
-            report.note(
-                "assumed_platform",
-                "no metadata say whether this is Android or iOS, whose signs differ: "
-                + (
-                    f"{'Android' if platform == 'android' else 'iOS'} is taken; set platform=ios and standardised"
-                    if seen is None
-                    else f"the magnetic field there and gravity have {'iOS' if turned else 'Android'}'s signs"
-                ),
-            )
+        platform, turned = _platform(options, about, tables, report)
         marks = tables.pop(ANNOTATION, None)
-        streams, others = _streams(path, tables, turned, platform, report, attachments)
+        streams, others = _streams(tables, turned, platform, report, attachments)
         return Import(
             channels=declared(s for s, _ in streams),
             blocks=_blocks(path, streams, others, report),
@@ -171,6 +157,28 @@ def _annotations(table: SensorTable, report: ReportBuilder) -> pl.DataFrame:
     )
 
 
+def _platform(
+    options: SensorLoggerOptions, about: dict[str, str], tables: Tables, report: ReportBuilder
+) -> tuple[str, bool]:
+    """Return the platform, and whether acceleration and gravity have iOS's sign."""
+    platform = options.platform or about.get("platform", "").lower()
+    standard = options.standardised
+    if standard is None:
+        standard = about.get("standardisation", "").lower() in ("true", "1", "yes")
+    if platform in ("android", "ios"):
+        return platform, platform == "ios" and not standard
+    turned = _turned_by_field(tables)
+    how = {
+        None: "Android is taken; set platform=ios and standardised",
+        False: "the magnetic field there and gravity have Android's signs",
+        True: "the magnetic field there and gravity have iOS's signs",
+    }[turned]
+    report.note(
+        "assumed_platform", f"no metadata say whether this is Android or iOS, whose signs differ: {how}"
+    )
+    return ("ios", True) if turned else ("android", False)
+
+
 def _turned_by_field(tables: Tables) -> bool | None:
     """Return whether gravity has iOS's sign, by the dip of the field at the first fix; None if it cannot tell."""
     gravity = tables.get("Gravity", tables.get("TotalAcceleration"))
@@ -181,13 +189,13 @@ def _turned_by_field(tables: Tables) -> bool | None:
     forces, fields = heads_of(gravity, tables.get("Magnetometer"))
     assert forces is not None
     field = _beside(fields, forces)
-    if field is None or not places.height or not set("xyz") <= set(forces.columns):
+    if field is None or not places.height or not set(_XYZ) <= set(forces.columns):
         return None
     from ..simulate.phone_world import earth_field
 
     there = earth_field(places["latitude"][0], places["longitude"][0], 0.0, places["t"][0])
     expected = math.asin(there[2] / float(np.linalg.norm(there)))
-    up = forces.select("x", "y", "z").to_numpy()
+    up = forces.select(_XYZ).to_numpy()
     size = np.linalg.norm(up, axis=1) * np.linalg.norm(field, axis=1)
     good = np.isfinite(size) & (size > 0)
     if not good.any():
@@ -199,7 +207,6 @@ def _turned_by_field(tables: Tables) -> bool | None:
 
 
 def _streams(
-    path: Path,
     tables: Tables,
     turned: bool,
     platform: str,
@@ -207,39 +214,38 @@ def _streams(
     attachments: list[SourceAttachment],
 ) -> tuple[list[tuple[Stream, SensorTable]], Tables]:
     """Return the streams and what each is read from, and the tables of which none is made."""
-    axes = ("x", "y", "z")
     sign = -1.0 if turned else 1.0
-    for name in [n for n in TRIPLES if n in tables and not set(axes) <= set(tables[n].head.columns)]:
+    for name in [n for n in TRIPLES if n in tables and not set(_XYZ) <= set(tables[n].head.columns)]:
         rows = sum(frame.height for frame in tables.pop(name).frames(report))
         report.drop("missing_column", f"{name}: not all of the columns x, y, z; left out", count=rows)
     left = dict(tables)
     streams: list[tuple[Stream, SensorTable]] = []
 
-    def add(parts: Sequence[StreamChannel], subject: str, table: SensorTable, *, even: bool = True) -> None:
-        stream = Stream(parts, report, subject=subject, even=even, attachments=attachments)
+    def add(part: StreamChannel, subject: str, table: SensorTable, *, even: bool = True) -> None:
+        stream = Stream([part], report, subject=subject, even=even, attachments=attachments)
         streams.append((stream, table))
 
     how, acc = _acceleration(left, turned)
     if acc is not None:
-        add([imu_part("/phone/acc", xyz(ACC, axes), gravity=how)], "acceleration", acc)
+        add(imu_part("/phone/acc", xyz(ACC, _XYZ), gravity=how), "acceleration", acc)
     elif "Accelerometer" in tables:
         report.loss(
             "gravity_free",
             "Accelerometer has no gravity and neither Gravity nor TotalAcceleration was recorded: no attitude from it",
         )
         part = StreamChannel(
-            "/phone/linear_acc", VALUES, xyz(ACC, axes, sign), ACC, metadata={"gravity": "removed"}
+            "/phone/linear_acc", VALUES, xyz(ACC, _XYZ, sign), ACC, metadata={"gravity": "removed"}
         )
-        add([part], "Accelerometer", left.pop("Accelerometer"))
-    for topic, names in (("/phone/gyr", "Gyroscope"), ("/phone/mag", "Magnetometer")):
-        name = next((n for n in (names, f"{names}Uncalibrated") if n in tables), None)
-        if name is not None and all(a in tables[name].head.columns for a in axes):
+        add(part, "Accelerometer", left.pop("Accelerometer"))
+    for sensor in ("Gyroscope", "Magnetometer"):
+        name = next((n for n in (sensor, f"{sensor}Uncalibrated") if n in tables), None)
+        if name is not None:
             part = (
-                imu_part(topic, xyz(GYR, axes), source=name)
-                if names == "Gyroscope"
-                else StreamChannel(topic, MAG, xyz(FIELD, axes, MICROTESLA), metadata={"source": name})
+                imu_part("/phone/gyr", xyz(GYR, _XYZ), source=name)
+                if sensor == "Gyroscope"
+                else StreamChannel("/phone/mag", MAG, xyz(FIELD, _XYZ, MICROTESLA), metadata={"source": name})
             )
-            add([part], name, left.pop(name))
+            add(part, name, left.pop(name))
     name = next((n for n in ("LocationGps", "Location") if n in tables), None)
     if name is not None:
         wanted = {
@@ -248,17 +254,17 @@ def _streams(
         }  # fmt: skip
         columns = {k: v for k, v in wanted.items() if v in tables[name].head.columns}
         if "lat" in columns and "lon" in columns:
-            add([fix_part(columns)], name, left.pop(name), even=False)
+            add(fix_part(columns), name, left.pop(name), even=False)
     if "Barometer" in tables and "pressure" in tables["Barometer"].head.columns:
         part = StreamChannel(
             "/phone/pressure", PRESSURE, {"pressure_pa": SourceColumn("pressure", HECTOPASCAL)}
         )
-        add([part], "Barometer", left.pop("Barometer"), even=False)
+        add(part, "Barometer", left.pop("Barometer"), even=False)
     if "Pedometer" in tables and "steps" in tables["Pedometer"].head.columns:
         part = StreamChannel("/phone/steps", VALUES, {"steps": SourceColumn("steps", 1.0)}, ("steps",))
-        add([part], "Pedometer", left.pop("Pedometer"), even=False)
-    told, turn = _orientation(tables, acc, platform)
-    if told:
+        add(part, "Pedometer", left.pop("Pedometer"), even=False)
+    judged, turn = _orientation(tables, acc, platform)
+    if judged:
         table = left.pop("Orientation")
         if turn is None:
             report.loss(
@@ -274,7 +280,7 @@ def _streams(
                 {q: SourceColumn(q, 1.0) for q in QUAT},
                 metadata={"north": north},
             )
-            add([part], "Orientation", table.each(turn.frame))
+            add(part, "Orientation", table.each(turn.frame))
     return streams, left
 
 
@@ -285,7 +291,7 @@ class _Turn(NamedTuple):
     north: bool
     """Whether its n has x north."""
 
-    def apply(self, values: np.ndarray) -> Any:
+    def apply(self, values: np.ndarray) -> Rotation:
         """Return rotations (n,) of quaternions x, y, z, w (n, 4)."""
         from scipy.spatial.transform import Rotation
 
@@ -309,7 +315,7 @@ def _quaternions(rows: pl.DataFrame) -> tuple[pl.DataFrame, np.ndarray]:
 
 
 def _orientation(tables: Tables, acc: SensorTable | None, platform: str) -> tuple[bool, _Turn | None]:
-    """Return whether the phone's own orientation can be judged, and how it is turned, None where it is wrong.
+    """Return whether the phone's own orientation can be judged, and how it is turned; None where it is wrong.
 
     The quaternion takes b to n or back, and its n has x east (Android) or north (iOS): of these the one is taken whose
     vertical is the measured force and whose north is the measured field; without a field, the platform's. The first
@@ -342,11 +348,11 @@ def _orientation(tables: Tables, acc: SensorTable | None, platform: str) -> tupl
 
 def _beside(table: pl.DataFrame | None, times: pl.DataFrame) -> np.ndarray | None:
     """Return the three axes of ``table`` at the times of another one, shape (n, 3)."""
-    if table is None or not table.height or any(a not in table.columns for a in "xyz"):
+    if table is None or not table.height or not set(_XYZ) <= set(table.columns):
         return None
     table = table.sort("t")
     return np.column_stack(
-        [np.interp(times["t"].to_numpy(), table["t"].to_numpy(), table[a].to_numpy()) for a in "xyz"]
+        [np.interp(times["t"].to_numpy(), table["t"].to_numpy(), table[a].to_numpy()) for a in _XYZ]
     )
 
 
@@ -390,7 +396,7 @@ def _with_gravity(
 
     for frame in acc:
         if not frame.height:
-            yield frame.select("t", "line", *"xyz")
+            yield frame.select("t", "line", *_XYZ)
             continue
         t = frame["t"].to_numpy()
         while (not near or near[-1]["t"].to_numpy().min() <= t.max()) and pull():
@@ -399,13 +405,13 @@ def _with_gravity(
             near.pop(0)
         beside = _beside(pl.concat(near), frame)
         assert beside is not None
-        yield frame.select("t", "line", *(pl.col(a) + pl.Series(beside[:, k]) for k, a in enumerate("xyz")))
+        yield frame.select("t", "line", *(pl.col(a) + pl.Series(beside[:, k]) for k, a in enumerate(_XYZ)))
     while pull():
         near.pop()
 
 
 def _scaled(table: SensorTable, factor: float) -> SensorTable:
-    return table.each(lambda frame: frame.with_columns(pl.col(a) * factor for a in "xyz"))
+    return table.each(lambda frame: frame.with_columns(pl.col(_XYZ) * factor))
 
 
 def _blocks(
