@@ -16,6 +16,10 @@ from .mapping import TextLayout
 from .text import BLOCK_BYTES, BOM, read_blocks, shown
 
 
+class NoRowError(MarchaError):
+    """A file ends before its first row."""
+
+
 class Cells:
     """A file of delimited text: its header, and its rows as text in blocks.
 
@@ -28,8 +32,10 @@ class Cells:
 
     Raises
     ------
+    NoRowError
+        The file is empty or ends before its first row.
     MarchaError
-        The file cannot be read, is empty or ends before its first row.
+        It cannot be read.
     """
 
     def __init__(self, path: Path, layout: TextLayout) -> None:
@@ -40,7 +46,7 @@ class Cells:
         first = next(self._blocks())[0]
         lines = first.split(b"\n", self._preamble + 1)
         if len(lines) <= self._preamble or not first.strip():
-            raise MarchaError(f"{path}: ends before its first row (layout.skip_rows = {layout.skip_rows})")
+            raise NoRowError(f"{path}: ends before its first row (layout.skip_rows = {layout.skip_rows})")
         row = self._split(self._first_row(first))
         names = [c.strip() for c in self._split(lines[layout.skip_rows])] if layout.header else []
         named = max((i + 1 for i, name in enumerate(names) if name), default=0)

@@ -21,6 +21,7 @@ import polars as pl
 from ..recording.codec import MAX_TIME_NS
 from ..recording.errors import MarchaError
 from ..recording.files import read_small
+from .cells import NoRowError
 from .columns import float_blocks, require_header
 from .contract import ReportBuilder
 from .text import start_of
@@ -153,12 +154,9 @@ def _csv(file: Path, report: ReportBuilder) -> SensorTable | None:
     texts = [n for n in header.names if n not in _NUMBERS]
 
     def frames(report: ReportBuilder) -> Iterator[pl.DataFrame]:
-        try:
+        with contextlib.suppress(NoRowError):  # said below
             for block in float_blocks(file, header, "time", report, integers=("time",), texts=texts):
                 yield block.rename({"time": "t"})
-        except MarchaError as error:
-            if "ends before its first row" not in str(error):
-                raise
 
     # What is found is said when all of it is read; a table without a row is read here.
     first = list(islice(frames(ReportBuilder()), HEAD_BLOCKS)) or list(frames(report))

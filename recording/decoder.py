@@ -108,7 +108,7 @@ class BoundLayout:
         self.stamps: list[str | None] = []
         constants: list[str] = [schema.frame if schema else "header.frame_id"]
         if schema is None:
-            self.rows.append(_flatten(layout, decoder))
+            self.rows.append(_flatten(layout))
             self.stamps.append("header.stamp" if "header.stamp.sec" in (layout.dtype.names or ()) else None)
         elif schema.explode:
             for k in range(layout.sequences[schema.explode]):
@@ -194,7 +194,7 @@ def _bind(
     return [by_name.get(c, Binding(c, "absent", "")) for c in columns]
 
 
-def _flatten(layout: Layout, decoder: Decoder) -> list[Binding]:
+def _flatten(layout: Layout) -> list[Binding]:
     """Return one column a leaf of a message that marcha has no schema for."""
     fields = layout.dtype.fields or {}
     bindings: list[Binding] = []

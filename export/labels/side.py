@@ -177,7 +177,7 @@ def lanes(rows: Iterable[tuple[str, int, int]]) -> list[int]:
     return out
 
 
-def lane_names(pairs: Iterable[tuple[str, Any]], word: str = "") -> dict[tuple[str, Any], str]:
+def lane_names(pairs: Iterable[tuple[str, Any]]) -> dict[tuple[str, Any], str]:
     """Return a tier's name in the file for each (tier, lane), no two alike: ``tier``, ``tier [2]``, …"""
     distinct = list(dict.fromkeys(pairs))
     taken = {tier for tier, _ in distinct}

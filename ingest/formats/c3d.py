@@ -100,7 +100,7 @@ class C3d:
         possible_rate(rate, path, "set POINT:RATE")
         t_ns = nanoseconds(head["first_frame"] + np.arange(len(pos)), 1e9 / rate)
         device = {"time": "frames at the header's rate; frame 1 is at 0", "rate_hz": f"{rate:g}"}
-        analog = _analog(path, head, signals, rate)
+        analog = _analog(path, head, signals)
         if pos.shape[1]:
             markers = marker_import(
                 t_ns, np.arange(1, len(pos) + 1), names, pos * factor, report, device, options
@@ -123,9 +123,7 @@ class C3d:
         )
 
 
-def _analog(
-    path: Path, head: dict[str, Any], signals: np.ndarray, rate: float
-) -> list[tuple[ChannelSpec, pl.DataFrame]]:
+def _analog(path: Path, head: dict[str, Any], signals: np.ndarray) -> list[tuple[ChannelSpec, pl.DataFrame]]:
     """Return analog channels: inertial ones (``foot/imu1/acc_x``) as readings, others as values under their labels."""
     labels = [n.strip() for n in head["analog"]][: signals.shape[1]]
     labels += [f"analog{k + 1}" for k in range(len(labels), signals.shape[1])]

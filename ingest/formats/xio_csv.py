@@ -18,13 +18,7 @@ from typing import ClassVar
 import polars as pl
 
 from ...recording.errors import MarchaError
-from ..columns import (
-    Header,
-    find_header,
-    float_blocks,
-    require_header,
-    with_ticks,
-)
+from ..columns import Header, find_header, float_blocks, require_header, with_ticks
 from ..contract import CommonOptions, Import, ReportBuilder
 from ..inertial import (
     ACC,
@@ -83,9 +77,9 @@ class XioCsv:
         report = ReportBuilder()
         on_leg = len(paths) > 1 or options.segments is not None
         names = segments_of(paths, options.segments, report) if on_leg else [""]
-        plans: list[ChannelColumns] = []
+        channels: list[ChannelColumns] = []
         streams: list[Iterator[tuple[str, pl.DataFrame]]] = []
-        times: dict[str, None] = {}
+        times: list[str] = []
         for path, segment in zip(paths, names, strict=True):
             one_file([path], self.name)
             header = require_header(path, _is_header, WANTED)
@@ -94,26 +88,25 @@ class XioCsv:
                 raise MarchaError(
                     f"{path}, line {header.line}: no column is a time such as 'Time (s)'; repair the header"
                 )
-            where, frame = (f"/leg/{segment}", f"{segment}_imu") if segment else ("/foot", "imu")
-            of_file = [
-                ChannelColumns(f"{where}/imu", IMU, complete(columns, ACC) | complete(columns, GYR), frame)
-            ]
+            place, frame_id = (f"/leg/{segment}", f"{segment}_imu") if segment else ("/foot", "imu")
+            readings = complete(columns, ACC) | complete(columns, GYR)
+            of_file = [ChannelColumns(f"{place}/imu", IMU, readings, frame_id)]
             if field := complete(columns, FIELD):
-                of_file.append(ChannelColumns(f"{where}/mag", MAG, field, frame))
-            used = [columns["t"].name, *(s.name for p in of_file for s in p.columns.values())]
+                of_file.append(ChannelColumns(f"{place}/mag", MAG, field, frame_id))
+            used = [columns["t"].name, *(s.name for c in of_file for s in c.columns.values())]
             note_unused(header.names, used, report, header.line)
             frames = _frames(path, header, columns["t"], report)
             streams.append(tables(path, frames, of_file, TimestampRepair(report, tick_ns=1), report))
-            plans += of_file
-            times[f"column {columns['t'].name!r}"] = None
+            channels += of_file
+            times.append(f"column {columns['t'].name!r}")
         return Import(
-            channels=[p.spec() for p in plans],
+            channels=[c.spec() for c in channels],
             blocks=chain.from_iterable(streams),
             report=report,
             metadata={
                 "device": {
                     "clock": "device",
-                    "time": ", ".join(times),
+                    "time": ", ".join(dict.fromkeys(times)),
                     "name": "x-io sensor, CSV",
                     "frames": "imu: the device's axes, right-handed; +1 g upwards at rest",
                 }

@@ -288,7 +288,7 @@ def phone_walk(scenario: str = "phone-turns", *, seed: int = 0, **options: Any) 
 
     field = earth_field(o.lat_deg, o.lon_deg, o.alt_m, start_ns)
     disturbance = magnetic_disturbance(
-        ground, walker.total_m, plan, walker, t, o.disturbance_t, o.disturbances, rng("disturbance")
+        ground, walker.total_m, plan, t, o.disturbance_t, o.disturbances, rng("disturbance")
     )
     mag = attitude.inv().apply(field + disturbance)
     ideal = o.errors == "none"

@@ -38,7 +38,6 @@ def magnetic_disturbance(
     ground: FloatArray,
     total_m: float,
     plan: Schedule,
-    walker: Walker,
     t: FloatArray,
     strength_t: float,
     count: int,
