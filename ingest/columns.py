@@ -16,7 +16,7 @@ from ..recording.errors import MarchaError
 from .cells import Cells
 from .contract import HEAD_BYTES, ReportBuilder
 from .mapping import TextLayout
-from .text import read_blocks
+from .text import start_of
 from .timestamps import MOST_NS
 
 PREAMBLE_LINES = 200
@@ -69,7 +69,7 @@ def find_header(head: bytes, accept: Callable[[Sequence[str]], bool]) -> Header 
 @lru_cache(maxsize=8)
 def _rows_of_cells(head: bytes) -> tuple[tuple[int, str, tuple[str, ...]], ...]:
     """Return line, separator and cells of what may be a header; kept, because many formats ask of one file."""
-    text = head.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "replace")
+    text = head.decode("utf-8-sig", "replace")
     lines = enumerate(_LINE_END.split(text, PREAMBLE_LINES)[:PREAMBLE_LINES], 1)
     return tuple(
         (number, separator, tuple(c.strip().strip('"') for c in line.split(separator)))
@@ -88,8 +88,7 @@ def require_header(path: Path, accept: Callable[[Sequence[str]], bool], wanted: 
     MarchaError
         The file cannot be read or has no such header; ``wanted`` says what one looks like.
     """
-    first, _ = next(read_blocks(path), (b"", True))
-    header = find_header(first[:HEAD_BYTES], accept)
+    header = find_header(start_of(path, HEAD_BYTES), accept)
     if header is None:
         raise MarchaError(f"{path}: no header line like {wanted!r} in its first {PREAMBLE_LINES} lines")
     names = [n for n in header.names if n]

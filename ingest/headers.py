@@ -17,7 +17,7 @@ import polars as pl
 
 from ..recording.errors import MarchaError, UsageError
 from .contract import ReportBuilder
-from .text import start_of
+from .text import BOM, read_whole, start_of
 
 UNIT = re.compile(r"[\[(]([^\])]*)[\])]")
 DECIMAL_COMMA = r"^([+-]?\d+),(\d+)$"
@@ -71,7 +71,7 @@ def plain(name: str) -> str:
 
 def header_of(head: bytes) -> TableHeader | None:
     """Return the header of a text table; None where the first line is none."""
-    line = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0].strip(b"\r")
+    line = head.removeprefix(BOM).split(b"\n", 1)[0].strip(b"\r")
     try:
         text = line.decode("utf-8")
     except UnicodeDecodeError:
@@ -108,10 +108,7 @@ def read_cells(
     MarchaError
         The file cannot be read or has no row.
     """
-    try:
-        text = path.read_bytes().decode("utf-8-sig", "replace")
-    except OSError as error:
-        raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
+    text = read_whole(path).decode("utf-8-sig", "replace")
     lines = pl.Series("row", text.replace("\r\n", "\n").split("\n")[1:], dtype=pl.String)
     rows = pl.DataFrame({"row": lines, "line": np.arange(2, len(lines) + 2)}).filter(
         pl.col("row").str.strip_chars() != ""

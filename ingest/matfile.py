@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..recording.errors import MarchaError
+from .text import read_whole
 
 MAGIC = b"MATLAB 5.0 MAT-file"
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -40,10 +41,7 @@ def read_mat(path: Path, names: set[str] | None = None) -> dict[str, Variable]:
     MarchaError
         The file cannot be read, is no MATLAB 5 file or is damaged.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
+    data = read_whole(path)
     if data[:8] == _HDF5 or data[:10] == b"MATLAB 7.3" or data[512:520] == _HDF5:
         raise MarchaError(f"{path}: a MATLAB 7.3 file (HDF5); save it with save(…, '-v7')")
     if not data.startswith(MAGIC) or data[126:128] not in (b"IM", b"MI"):

@@ -14,8 +14,8 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from ..recording.errors import MarchaError
 from .contract import ChannelSpec, Report, ReportBuilder, SourceAttachment
+from .text import read_whole
 
 RADIO = "marcha_msgs/msg/RadioSignal"
 POINT = "geometry_msgs/msg/PointStamped"
@@ -219,10 +219,7 @@ def ordered(table: pl.DataFrame, label: str, report: ReportBuilder) -> pl.DataFr
 
 def read_text(path: Path) -> str:
     """Return a text file; MarchaError names it where it cannot be read."""
-    try:
-        return path.read_bytes().decode("utf-8-sig", "replace")
-    except OSError as error:
-        raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return read_whole(path).decode("utf-8-sig", "replace")
 
 
 def survey(points: Sequence[tuple[int, int, Sequence[float]]]) -> pl.DataFrame:

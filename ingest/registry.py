@@ -18,6 +18,7 @@ from ..recording.options import options_of
 from ..recording.plugins import plugins
 from .archive import UNPACK_LIMIT_GB, is_zip, unpacked
 from .contract import HEAD_BYTES, CommonOptions, Importer
+from .text import start_of
 from .truth import is_side_file
 from .workbook import is_workbook
 
@@ -360,13 +361,7 @@ def _is_data(path: Path, folder: Path) -> bool:
 
 
 def _head(path: Path) -> bytes:
-    if path.is_dir():
-        return b""
-    try:
-        with path.open("rb") as f:
-            return f.read(HEAD_BYTES)
-    except OSError as error:
-        raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return b"" if path.is_dir() else start_of(path, HEAD_BYTES)
 
 
 def _checked(kind: Any) -> Any:

@@ -45,7 +45,7 @@ class IntegerRows:
 
 
 def start_of(path: Path, size: int = 4096) -> bytes:
-    """Return the first bytes of a file.
+    """Return the first bytes of a file; all of them where ``size`` is negative.
 
     Raises
     ------
@@ -57,6 +57,11 @@ def start_of(path: Path, size: int = 4096) -> bytes:
             return f.read(size)
     except OSError as error:
         raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def read_whole(path: Path) -> bytes:
+    """Return all bytes of a file; raises as :func:`start_of`."""
+    return start_of(path, -1)
 
 
 def read_blocks(path: Path, size: int | None = BLOCK_BYTES) -> Iterator[tuple[bytes, bool]]:

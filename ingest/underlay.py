@@ -13,6 +13,7 @@ from pathlib import Path
 
 from ..recording.errors import MarchaError
 from .contract import SourceAttachment
+from .text import read_whole
 
 MEDIA = {
     "streets.geojson": "application/geo+json",
@@ -38,10 +39,7 @@ def read_underlay(paths: Sequence[Path]) -> list[SourceAttachment]:
     """
     files = []
     for path in paths:
-        try:
-            data = path.read_bytes()
-        except OSError as error:
-            raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
+        data = read_whole(path)
         if path.suffix in (".geojson", ".json"):
             try:
                 content = json.loads(data)

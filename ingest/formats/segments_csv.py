@@ -30,7 +30,7 @@ from ..leg import (
 )
 from ..mapping import CellSource, Mapping, TextLayout, Time, Topic
 from ..orientations import OrientationOptions, with_angles
-from ..text import read_blocks
+from ..text import start_of
 from ..timestamps import possible_rate
 from .table import open_table
 
@@ -78,7 +78,7 @@ class SegmentsCsv:
     def read(self, paths: Sequence[Path], options: SegmentsOptions) -> Import:
         """Read one file."""
         path = paths[0]
-        head = next(read_blocks(path), (b"", True))[0][:HEAD_BYTES]
+        head = start_of(path, HEAD_BYTES)
         rate, header = _RATE.search(head[:4096]), find_header(head, _accept)
         if rate is None or header is None:
             raise MarchaError(

@@ -31,7 +31,7 @@ from ..leg import (
 )
 from ..mapping import CellSource, Mapping, TextLayout, Time, Topic
 from ..orientations import DEVICE_TOPIC, OrientationOptions, with_angles
-from ..text import read_blocks
+from ..text import start_of
 from ..timestamps import Rate, possible_rate
 from .table import open_table
 
@@ -104,7 +104,7 @@ class XsensText:
         magnetic = []
         rates = set()
         for path, key in zip(paths, own, strict=True):
-            head = next(read_blocks(path), (b"", True))[0][:HEAD_BYTES]
+            head = start_of(path, HEAD_BYTES)
             header = _header(head)
             if header is None:
                 raise MarchaError(
@@ -148,7 +148,7 @@ class XsensText:
 
 def _header(head: bytes) -> _Header | None:
     rate = None
-    text = head.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "replace")
+    text = head.decode("utf-8-sig", "replace")
     for number, line in enumerate(re.split(r"\r\n|\n|\r", text)[:60], 1):
         if line.startswith("//"):
             match = _RATE.match(line)
