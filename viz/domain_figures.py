@@ -15,13 +15,13 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ..recording import Recording
-from ..recording.errors import UsageError
 from ..replay.evaluate import evaluate
 from ..replay.references import shown_reference
 from . import indoor_figures, joint_figures, plan_figures, style
 from .canvas import PLACES, is_estimate
 from .curve import Curve
 from .floor import Anchor, plan_of
+from .panels import TIME, dress, nothing, run_color, seconds
 from .phone_figures import detector, street_map, transform
 from .shapes import ELLIPSE95, circle, geo_circle, metres_a_degree
 from .stance_figures import conditions
@@ -37,10 +37,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
-GRID = {"color": "#DDDDDD", "linewidth": 0.6}
 JOINT, NAMED = "sensor_msgs/msg/JointState", "marcha_msgs/msg/NamedValues"
 MOST_ELLIPSES = 25
-TIME = "time since the start (s)"
 
 
 def _topics(rec: Recording, needs: Sequence[str], *schemas: str, role: str = "") -> list[str]:
@@ -57,13 +55,8 @@ def _topics(rec: Recording, needs: Sequence[str], *schemas: str, role: str = "")
 
 def _require(rec: Recording, what: str, topics: list[str]) -> list[str]:
     if not topics:
-        raise UsageError(f"{rec.path}: nothing for this figure: no {what}")
+        raise nothing(rec, f"no {what}")
     return topics
-
-
-def _s(rec: Recording, table: pl.DataFrame) -> Floats:
-    """Return times since the start of the recording, s."""
-    return (table["t_ns"].to_numpy() - (rec.start_ns or 0)) / 1e9
 
 
 def _owner(topic: str) -> str:
@@ -71,21 +64,9 @@ def _owner(topic: str) -> str:
 
 
 def _color(rec: Recording, topic: str) -> str:
-    runs = list(dict.fromkeys(t.split("/")[2] for t in rec.channels if is_estimate(t)))
     if is_estimate(topic):
-        return style.run_color(runs.index(topic.split("/")[2]))
+        return run_color(rec, topic.split("/")[2])
     return style.REFERENCE if role_of(topic) == "reference" else style.DEVICE
-
-
-def _dress(ax: Axes, title: str, x: str, y: str, *, legend: bool = True) -> None:
-    ax.set_title(title, fontsize=10, loc="left")
-    ax.set_xlabel(x, fontsize=9)
-    ax.set_ylabel(y, fontsize=9)
-    ax.tick_params(labelsize=8)
-    ax.grid(**GRID)
-    ax.set_axisbelow(True)
-    if legend and ax.get_legend_handles_labels()[0]:
-        ax.legend(fontsize=8, loc="best")
 
 
 def _rows(fig: Figure, count: int) -> list[Axes]:
@@ -109,11 +90,11 @@ def signals(rec: Recording, fig: Figure) -> None:
     for ax, (topic, key, unit) in zip(_rows(fig, len(panels)), panels, strict=True):
         names = [f"{key}_{a}" for a in "xyz"]
         t_ns, values = thinned(rec, topic, partial(_with_norm, names=names))
-        t = (t_ns - (rec.start_ns or 0)) / 1e9
+        t = seconds(rec, t_ns)
         for i, a in enumerate("xyz"):
             ax.plot(t, values[:, i], color=style.AXES[i], linewidth=0.8, label=a)
         ax.plot(t, values[:, 3], color=style.NORM, linewidth=0.8, label="norm")
-        _dress(ax, f"{printable(topic)} {key}", TIME, unit)
+        dress(ax, f"{printable(topic)} {key}", TIME, unit)
 
 
 def steps(rec: Recording, fig: Figure) -> None:
@@ -124,20 +105,20 @@ def steps(rec: Recording, fig: Figure) -> None:
     norm: tuple[Floats, Floats] | None = None
     if sensors:
         t_ns, values = thinned(rec, sensors[0], acc_norm)
-        norm = (t_ns - (rec.start_ns or 0)) / 1e9, values[:, 0]
+        norm = seconds(rec, t_ns), values[:, 0]
         top.plot(*norm, color=style.NORM, linewidth=0.7, label=f"‖acc‖ of {printable(sensors[0])}")
     for topic in topics:
         table, color = rec.table(topic), _color(rec, topic)
-        t, length = _s(rec, table), table["length_m"].to_numpy()
+        t, length = seconds(rec, table["t_ns"]), table["length_m"].to_numpy()
         height = np.interp(t, *norm) if norm else np.ones(len(t))
         top.plot(t, height, "d", color=color, markersize=4, label=f"{_owner(topic)}: {len(t)} steps")
         edges = np.arange(len(t) + 1) + 0.5
         lengths.stairs(length, edges, fill=True, color=color, alpha=0.7, label=_owner(topic))
         way.step(np.arange(1, len(t) + 1), np.nancumsum(length), color=color, label=_owner(topic))
-    _dress(top, "steps along the norm", TIME, "m/s²")
+    dress(top, "steps along the norm", TIME, "m/s²")
     lengths.set_ylim(top=1.3 * lengths.get_ylim()[1])  # room for the legend
-    _dress(lengths, "step lengths", "step", "m")
-    _dress(way, "distance so far", "step", "m")
+    dress(lengths, "step lengths", "step", "m")
+    dress(way, "distance so far", "step", "m")
 
 
 def heading(rec: Recording, fig: Figure) -> None:
@@ -155,14 +136,18 @@ def heading(rec: Recording, fig: Figure) -> None:
     for ax, topic in zip(axes, fields, strict=False):
         table = rec.table(topic)
         for i, a in enumerate("xy"):
-            ax.plot(_s(rec, table), table[f"mag_{a}"].to_numpy() * 1e6, color=style.AXES[i], label=a)
-        _dress(ax, f"{printable(topic)}", TIME, "µT")
+            ax.plot(
+                seconds(rec, table["t_ns"]), table[f"mag_{a}"].to_numpy() * 1e6, color=style.AXES[i], label=a
+            )
+        dress(ax, f"{printable(topic)}", TIME, "µT")
     for i, (topic, column) in enumerate(headings):
         table = rec.table(topic).filter(pl.col(column).is_finite())
         turned = np.degrees(np.unwrap(table[column].to_numpy()))
         name = f"{_owner(topic)} {column.removesuffix('_rad')}"
-        axes[-1].plot(_s(rec, table), turned, color=style.axis_color(i), linewidth=1.0, label=name)
-    _dress(axes[-1], "heading (unwrapped)", TIME, "°")
+        axes[-1].plot(
+            seconds(rec, table["t_ns"]), turned, color=style.axis_color(i), linewidth=1.0, label=name
+        )
+    dress(axes[-1], "heading (unwrapped)", TIME, "°")
     axes[-1].legend(fontsize=7, ncols=4, loc="upper center", bbox_to_anchor=(0.5, -0.18))  # many lines: below
 
 
@@ -187,12 +172,12 @@ def fixes(rec: Recording, fig: Figure) -> None:
             sd = table.select("sd_east_m", "sd_north_m").to_numpy()
             for ring in (geo_circle(place, sd) - first) * scale:
                 metres.plot(ring[:, 1], ring[:, 0], color=color, linewidth=0.5, alpha=0.6)
-    _dress(degrees, "fixes", "longitude (°)", "latitude (°)")
+    dress(degrees, "fixes", "longitude (°)", "latitude (°)")
     degrees.ticklabel_format(useOffset=False)
     degrees.tick_params(axis="x", rotation=20)
     if first is not None:
         degrees.set_aspect(1.0 / np.cos(np.radians(first[0])))
-    _dress(metres, "about the first fix (circles: ±1σ)", "east (m)", "north (m)")
+    dress(metres, "about the first fix (circles: ±1σ)", "east (m)", "north (m)")
     metres.set_aspect("equal", adjustable="datalim")
 
 
@@ -213,18 +198,10 @@ def floor(rec: Recording, fig: Figure) -> None:
     """Floor plan with anchors by technology, tracks beside the true path, and 95 % ellipses."""
     plan, traces = plan_of(rec), _traces(rec)
     if not plan and not traces:
-        raise UsageError(f"{rec.path}: nothing for this figure: neither plan nor anchors nor tracks")
+        raise nothing(rec, "neither plan nor anchors nor tracks")
     fig.set_size_inches(9.0, 7.0)
     ax = fig.subplots()
-    if plan.picture is not None:
-        ax.imshow(plan.picture, extent=plan.corners, alpha=0.6)
-    for line in plan.outlines:
-        ax.plot(line[:, 0], line[:, 1], color="#777777", linewidth=1.0)
-    for i, kind in enumerate(dict.fromkeys(a.technology for a in plan.anchors.values())):
-        positions = np.array([a.position for a in plan.anchors.values() if a.technology == kind])
-        ax.plot(
-            positions[:, 0], positions[:, 1], "s^vPX*"[i % 6], color="black", label=f"anchors {kind}".strip()
-        )
+    plan_figures.draw_floor(ax, plan)
     for topic, trace in traces.items():
         p = trace.positions
         mark = "o" if trace.sparse and is_estimate(topic) else ""
@@ -235,8 +212,7 @@ def floor(rec: Recording, fig: Figure) -> None:
             axes = ELLIPSE95 * kept.select("sigma_pos_x", "sigma_pos_y").to_numpy()
             for ring in circle(trace.at(kept["t_ns"].to_numpy()), axes):
                 ax.plot(ring[:, 0], ring[:, 1], color=trace.color, linewidth=0.5, alpha=0.5)
-    _dress(ax, "from above (ellipses: 95 %)", "x (m)", "y (m)")
-    ax.set_aspect("equal", adjustable="datalim")
+    dress(ax, "from above (ellipses: 95 %)", "x (m)", "y (m)")
 
 
 def _columns(rec: Recording, topic: str) -> tuple[str, ...]:
@@ -258,7 +234,7 @@ def radio(rec: Recording, fig: Figure) -> None:
         rows = table.filter(pl.col("mac") == mac)
         rssi, color = rows["rssi_dbm"].cast(pl.Float64).to_numpy(), style.run_color(i)
         look = {"color": color, "label": printable(mac)}
-        axes[0].plot(_s(rec, rows), rssi, ".", markersize=3, **look)
+        axes[0].plot(seconds(rec, rows["t_ns"]), rssi, ".", markersize=3, **look)
         axes[1].hist(rssi, bins=np.arange(-110.0, 0.0, 2.0), histtype="step", **look)
         anchor: Anchor | None = anchors.get(mac.lower())
         if beside and truth is not None and anchor is not None:
@@ -266,15 +242,13 @@ def radio(rec: Recording, fig: Figure) -> None:
             axes[2].plot(gone, rssi, ".", markersize=3, **look)
             d = np.geomspace(0.5, max(float(gone.max()), 1.0), 60)
             axes[2].plot(d, anchor.p_d0 - 10 * anchor.eta * np.log10(d), color=color, linewidth=1.0)
-    _dress(
-        axes[0], f"{printable(topic)}, {len(macs)} of {len(counts)} transmitters", TIME, "dBm", legend=False
-    )
-    _dress(axes[1], "histogram", "dBm", "packets")  # the legend hides least here
+    dress(axes[0], f"{printable(topic)}, {len(macs)} of {len(counts)} transmitters", TIME, "dBm", legend=None)
+    dress(axes[1], "histogram", "dBm", "packets")  # the legend hides least here
     seen = table["rssi_dbm"].cast(pl.Float64)
     axes[1].set_xlim(float(seen.min() or -100.0) - 3, float(seen.max() or 0.0) + 3)  # type: ignore[arg-type]
     if beside:
-        _dress(
-            axes[2], "over the true distance (lines: the anchors' model)", "distance (m)", "dBm", legend=False
+        dress(
+            axes[2], "over the true distance (lines: the anchors' model)", "distance (m)", "dBm", legend=None
         )
         axes[2].set_xscale("log")
 
@@ -295,14 +269,14 @@ def error(rec: Recording, fig: Figure) -> None:
     over, share = fig.subplots(1, 2)
     for topic, result in results.items():
         far, color = distance(result), traces[topic].color
-        over.plot((result.t_ns - (rec.start_ns or 0)) / 1e9, far, color=color, label=_owner(topic))
+        over.plot(seconds(rec, result.t_ns), far, color=color, label=_owner(topic))
         ordered = np.sort(far)
         percent = 100.0 * np.arange(1, len(far) + 1) / len(far)
         median, p95 = np.percentile(far, [50, 95])
         name = f"{_owner(topic)}: mean {far.mean():.2f}, median {median:.2f}, 95 % {p95:.2f} m"
         share.step(ordered, percent, color=color, where="post", label=name)
-    _dress(over, "error of the position (not aligned)", TIME, "m", legend=False)
-    _dress(share, "distribution", "error (m)", "% of the samples")
+    dress(over, "error of the position (not aligned)", TIME, "m", legend=None)
+    dress(share, "distribution", "error (m)", "% of the samples")
 
 
 def joints(rec: Recording, fig: Figure) -> None:
@@ -325,9 +299,15 @@ def joints(rec: Recording, fig: Figure) -> None:
             table, curves[topic] = rec.table(topic), Curve()
             values = np.degrees(table[joint].to_numpy())
             curves[topic].add(table["t_ns"].to_numpy(), values)
-            ax.plot(_s(rec, table), values, color=_color(rec, topic), linewidth=1.1, label=_owner(topic))
+            ax.plot(
+                seconds(rec, table["t_ns"]),
+                values,
+                color=_color(rec, topic),
+                linewidth=1.1,
+                label=_owner(topic),
+            )
         printed = printable(joint)
-        _dress(ax, f"{printed} angle", TIME, "°")
+        dress(ax, f"{printed} angle", TIME, "°")
         if joint not in judged:
             continue
         below = next(axes)
@@ -335,7 +315,7 @@ def joints(rec: Recording, fig: Figure) -> None:
         widest = 1.0
         for topic in filter(is_estimate, curves):
             t_ns, wrong = difference(curves[topic], curves[truth])
-            t, color = (t_ns - (rec.start_ns or 0)) / 1e9, _color(rec, topic)
+            t, color = seconds(rec, t_ns), _color(rec, topic)
             rmse = float(np.sqrt(np.mean(wrong**2))) if len(wrong) else np.nan
             widest = max(widest, 1.2 * float(np.percentile(np.abs(wrong), 99.5)) if len(wrong) else 0.0)
             below.plot(t, wrong, color=color, linewidth=1.0, label=f"{_owner(topic)}: RMSE {rmse:.2f}°")
@@ -343,10 +323,10 @@ def joints(rec: Recording, fig: Figure) -> None:
             if joint in _columns(rec, stated):
                 table = rec.table(stated)
                 sd = np.degrees(table[joint].to_numpy())
-                below.fill_between(_s(rec, table), -sd, sd, color=color, alpha=0.2, linewidth=0)
+                below.fill_between(seconds(rec, table["t_ns"]), -sd, sd, color=color, alpha=0.2, linewidth=0)
                 widest = max(widest, 1.2 * float(np.nanmedian(sd)))
         below.set_ylim(-widest, widest)
-        _dress(below, f"{printed} error to {_owner(truth)} (area: ±1σ)", TIME, "°")
+        dress(below, f"{printed} error to {_owner(truth)} (area: ±1σ)", TIME, "°")
 
 
 def jumps(rec: Recording, fig: Figure) -> None:
@@ -358,7 +338,7 @@ def jumps(rec: Recording, fig: Figure) -> None:
     for ax, topic in zip(_rows(fig, len(topics)), topics, strict=True):
         names = [printable(n.strip()) for n in rec.channels[topic].metadata["states"].split(",")]
         table = rec.table(topic).filter(pl.col("state").is_finite())
-        t, state = _s(rec, table), table["state"].to_numpy()
+        t, state = seconds(rec, table["t_ns"]), table["state"].to_numpy()
         edges = np.flatnonzero(np.diff(state)) + 1
         starts, ends = np.concatenate([[0], edges]), np.concatenate([edges, [len(state) - 1]])
         for k, name in enumerate(names):
@@ -367,7 +347,7 @@ def jumps(rec: Recording, fig: Figure) -> None:
             label = f"{name}: {100.0 * float(np.mean(state == k)) if len(state) else 0.0:.0f} %"
             ax.broken_barh(bars, (k - 0.4, 0.8), facecolors=style.run_color(k), label=label)
         ax.set_yticks(range(len(names)), names)
-        _dress(ax, f"{_owner(topic)}: state, {len(edges)} changes", TIME, "", legend=False)
+        dress(ax, f"{_owner(topic)}: state, {len(edges)} changes", TIME, "", legend=None)
         ax.legend(fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(names), frameon=False)
 
 
@@ -379,10 +359,7 @@ def cycles(rec: Recording, fig: Figure) -> None:
         for joint in run.cycles
     ]
     if not results:
-        raise UsageError(
-            f"{rec.path}: nothing for this figure: no joint angle with a reference over two cycles; "
-            "without a reference: strides"
-        )
+        raise nothing(rec, "no joint angle with a reference over two cycles; without a reference: strides")
     percent = np.arange(101)
     axes = _rows(fig, 2 * len(results))
     for (run, joint), ax, below in zip(results, axes[::2], axes[1::2], strict=True):
@@ -400,9 +377,9 @@ def cycles(rec: Recording, fig: Figure) -> None:
         name = printable(joint.joint)
         start = "annotated contacts" if joint.starts == "events" else "main maxima of the reference"
         cycle = f"gait cycle (%), from the {start}"
-        _dress(ax, f"{name} over {joint.count} cycles", cycle, "°")
+        dress(ax, f"{name} over {joint.count} cycles", cycle, "°")
         rmse = float(np.mean(joint.rmse))
-        _dress(below, f"{name}: error, RMSE a cycle {rmse:.2f}° (mean)", cycle, "°")
+        dress(below, f"{name}: error, RMSE a cycle {rmse:.2f}° (mean)", cycle, "°")
 
 
 FIGURES: dict[str, Callable[[Recording, Any], None]] = {

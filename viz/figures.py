@@ -22,6 +22,7 @@ from ..replay.references import shown_reference
 from ..replay.trajectory import stances_of
 from ..replay.view import Comparison
 from . import style
+from .panels import GRID, TIME
 from .text import printable
 from .thinned import acc_norm, pieces, thinned
 from .trace import Trace, compared, distance, framed
@@ -39,7 +40,6 @@ WALK = "walk"
 POINTS = 20_000
 """Most points of a line: more than any printer resolves."""
 
-GRID = {"color": "#DDDDDD", "linewidth": 0.6}
 POSE = "geometry_msgs/msg/PoseStamped"
 POSITION_SIGMA = ("sigma_pos_x", "sigma_pos_y", "sigma_pos_z")
 
@@ -120,7 +120,7 @@ def _figure(chosen: list[Recording], kind: str, alignment: str) -> Figure:
         _plan(plan, walk)
         for ax, draw in zip(others, (_heights, _errors), strict=False):
             _time(ax, draw, walk)
-            ax.set_xlabel("time since the start (s)", fontsize=9)
+            ax.set_xlabel(TIME, fontsize=9)
     handles = {}
     for walk in walks:
         for track in walk.shown:

@@ -14,6 +14,7 @@ from ..recording.errors import UsageError
 from . import style
 from .canvas import is_estimate
 from .floor import plan_of
+from .panels import nothing, seconds
 from .plan_figures import draw_floor, true_positions
 from .shapes import circle
 from .text import printable
@@ -96,9 +97,7 @@ def ranges(rec: Recording, fig: Figure) -> None:
         if is_estimate(t) and c.schema == RANGING and t.endswith("/corrected") and c.count
     ]
     if not runs:
-        raise UsageError(
-            f"{rec.path}: nothing for this figure: no run with ranges (indoor.trilateration, indoor.hybrid)"
-        )
+        raise nothing(rec, "no run with ranges (indoor.trilateration, indoor.hybrid)")
     plan, run = plan_of(rec), runs[0]
     before, after = rec.table(f"{run}/ranges"), rec.table(f"{run}/corrected")
     joined = before.join(after, on=["t_ns", "mac"], suffix="_after")
@@ -151,7 +150,7 @@ def powers(rec: Recording, fig: Figure) -> None:
         source = {}
     fitted = [a for a in models if a.get("p_d0") is not None][:MOST_ANCHORS]
     if not fitted:
-        raise UsageError(f"{rec.path}: nothing for this figure: no anchor with powers at four distances")
+        raise nothing(rec, "no anchor with powers at four distances")
     anchors = plan_of(rec).anchors
     topic = next(t for t, c in rec.channels.items() if c.schema == RADIO and c.count and not is_estimate(t))
     table, truth = rec.table(topic), true_positions(rec)
@@ -214,10 +213,10 @@ def threshold(rec: Recording, fig: Figure) -> None:
         (t for t, c in rec.channels.items() if "acc_z" in c.columns and c.count and not is_estimate(t)), None
     )
     if acc is None:
-        raise UsageError(f"{rec.path}: nothing for this figure: no accelerometer")
+        raise nothing(rec, "no accelerometer")
     table, whole = first_rows(rec, acc)
     t_ns = table["t_ns"].to_numpy()
-    t, values = (t_ns - (rec.start_ns or 0)) / 1e9, table.select("acc_x", "acc_y", "acc_z").to_numpy()
+    t, values = seconds(rec, t_ns), table.select("acc_x", "acc_y", "acc_z").to_numpy()
     linear = values[:, 2] - _low_pass(t, values[:, 2])
     runs = [t for t, c in rec.channels.items() if is_estimate(t) and c.schema.endswith("/Step") and c.count]
     fig.set_size_inches(12.0, 6.5)
@@ -236,7 +235,7 @@ def threshold(rec: Recording, fig: Figure) -> None:
         ends = ends if whole else ends[ends <= t_ns[-1]]
         name = f"{printable(topic.split('/')[2])}: {len(ends)} steps"
         top.plot(
-            (ends - (rec.start_ns or 0)) / 1e9,
+            seconds(rec, ends),
             np.interp(ends, t_ns, linear),
             "d",
             color=style.run_color(k),
@@ -253,9 +252,7 @@ def threshold(rec: Recording, fig: Figure) -> None:
         q, _ = first_rows(rec, turn)
         w, x, y, z = q.select("quat_w", "quat_x", "quat_y", "quat_z").to_numpy().T
         azimuth = np.degrees(np.unwrap(np.arctan2(2 * (x * y - w * z), 1 - 2 * (x * x + z * z))))
-        below.plot(
-            (q["t_ns"].to_numpy() - (rec.start_ns or 0)) / 1e9, azimuth, color=style.DEVICE, linewidth=0.8
-        )
+        below.plot(seconds(rec, q["t_ns"]), azimuth, color=style.DEVICE, linewidth=0.8)
         _title(below, f"azimuth of {printable(turn)} (clockwise from north, unwrapped)")
     below.set_ylabel("°", fontsize=9)
     below.set_xlabel("time (s)", fontsize=9)

@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-import polars as pl
 from numpy.typing import NDArray
 
 from ..recording import Recording
-from ..recording.errors import UsageError
 from ..replay.evaluate import evaluate
 from . import style
 from .canvas import is_estimate
+from .panels import TIME, dress, nothing, run_color, seconds
 from .text import printable
 from .views.common import EULER, euler_deg
 from .views.joint import segment_of
@@ -23,7 +22,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-TIME = "time since the start (s)"
+ABOVE = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 5, "frameon": False}
 ACCELEROMETER, GYROSCOPE = "#cdb4e8", "#c9a227"
 
 
@@ -34,31 +33,6 @@ def _runs(rec: Recording, output: str, column: str = "") -> dict[str, str]:
         for t, c in rec.channels.items()
         if is_estimate(t) and t.endswith(f"/{output}") and c.count and (not column or column in c.columns)
     }
-
-
-def _color(rec: Recording, run: str) -> str:
-    return style.run_color(
-        list(dict.fromkeys(t.split("/")[2] for t in rec.channels if is_estimate(t))).index(run)
-    )
-
-
-def _dress(ax: Axes, title: str, x: str, y: str, ncols: int = 5) -> None:
-    ax.set_title(title, fontsize=10, loc="left")
-    ax.set_xlabel(x, fontsize=9)
-    ax.set_ylabel(y, fontsize=9)
-    ax.tick_params(labelsize=8)
-    ax.grid(color="#dddddd", linewidth=0.6)
-    ax.set_axisbelow(True)
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(fontsize=8, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=ncols, frameon=False)
-
-
-def _nothing(rec: Recording, what: str) -> UsageError:
-    return UsageError(f"{rec.path}: nothing for this figure: no {what}")
-
-
-def _seconds(rec: Recording, table: pl.DataFrame) -> Floats:
-    return (table["t_ns"].to_numpy() - (rec.start_ns or 0)) / 1e9
 
 
 def single_sensor_deg(t: Floats, acc: Floats, gyr: Floats) -> tuple[Floats, Floats]:
@@ -82,7 +56,7 @@ def attitude(rec: Recording, fig: Figure) -> None:
     names = list(dict.fromkeys(n for t in runs.values() for n in rec.channels[t].columns))
     angles = [tuple(n.rsplit("_", 1)) for n in names if n.rsplit("_", 1)[-1] in EULER and "_" in n]
     if not angles:
-        raise _nothing(rec, "attitude of a segment (run joint.sme, joint.smea, joint.local …)")
+        raise nothing(rec, "no attitude of a segment (run joint.sme, joint.smea, joint.local …)")
     fig.set_size_inches(10.0, 1.2 + 2.6 * len(angles))
     axes = fig.subplots(len(angles), 1, squeeze=False, sharex=True)[:, 0]
     for ax, (segment, axis) in zip(axes, angles, strict=True):
@@ -91,7 +65,7 @@ def attitude(rec: Recording, fig: Figure) -> None:
             table = rec.table(imu)
             parts = [table.select(f"{q}_{a}" for a in "xyz").to_numpy() for q in ("acc", "gyr")]
             by_acc, by_gyr = single_sensor_deg(table["t_ns"].to_numpy() / 1e9, *parts)
-            t = _seconds(rec, table)
+            t = seconds(rec, table["t_ns"])
             ax.plot(t, by_acc[:, k], color=ACCELEROMETER, linewidth=0.6, label="accelerometer")
             ax.plot(t, by_gyr[:, k], color=GYROSCOPE, linewidth=0.9, linestyle="--", label="gyroscope alone")
         for topic, channel in rec.channels.items():
@@ -102,7 +76,11 @@ def attitude(rec: Recording, fig: Figure) -> None:
                 turn = table.select(f"quat_{a}" for a in "wxyz").to_numpy()
                 shown.append(euler_deg(turn)[:, k])
                 ax.plot(
-                    _seconds(rec, table), shown[-1], color=style.REFERENCE, linewidth=1.6, label="reference"
+                    seconds(rec, table["t_ns"]),
+                    shown[-1],
+                    color=style.REFERENCE,
+                    linewidth=1.6,
+                    label="reference",
                 )
                 break
         for run, topic in runs.items():
@@ -110,15 +88,15 @@ def attitude(rec: Recording, fig: Figure) -> None:
                 table = rec.table(topic)
                 shown.append(np.degrees(table[f"{segment}_{axis}"].to_numpy()))
                 ax.plot(
-                    _seconds(rec, table),
+                    seconds(rec, table["t_ns"]),
                     shown[-1],
-                    color=_color(rec, run),
+                    color=run_color(rec, run),
                     linewidth=1.1,
                     label=printable(run),
                 )
         _frame(ax, shown)
         note = "" if any(line.get_label() == "reference" for line in ax.get_lines()) else ", no reference"
-        _dress(ax, f"{printable(segment)} {axis}{note}", TIME, "°")
+        dress(ax, f"{printable(segment)} {axis}{note}", TIME, "°", legend=ABOVE)
 
 
 def _frame(ax: Axes, curves: list[Floats]) -> None:
@@ -133,7 +111,7 @@ def transitions(rec: Recording, fig: Figure) -> None:
     """Jump diagram: every state that occurs with its share of the time, every transition with its number."""
     runs = {r: t for r, t in _runs(rec, "jump", "state").items() if "states" in rec.channels[t].metadata}
     if not runs:
-        raise _nothing(rec, "named states (joint.smp, joint.sme, joint.smea)")
+        raise nothing(rec, "no named states (joint.smp, joint.sme, joint.smea)")
     fig.set_size_inches(6.0 * len(runs), 5.6)
     for ax, (run, topic) in zip(fig.subplots(1, len(runs), squeeze=False)[0], runs.items(), strict=True):
         names = [printable(n.strip()) for n in rec.channels[topic].metadata["states"].split(",")]
@@ -175,11 +153,11 @@ def cross(rec: Recording, fig: Figure) -> None:
     """Cross gains: share of each angle's correction from foreign rows, plain and weighted by the innovation."""
     runs = _runs(rec, "cross")
     if not runs:
-        raise _nothing(rec, "cross gains (joint.sme, joint.smea)")
+        raise nothing(rec, "no cross gains (joint.sme, joint.smea)")
     fig.set_size_inches(10.0, 1.2 + 3.0 * len(runs))
     for ax, (run, topic) in zip(fig.subplots(len(runs), 1, squeeze=False)[:, 0], runs.items(), strict=True):
         table = rec.table(topic)
-        t = _seconds(rec, table)
+        t = seconds(rec, table["t_ns"])
         plain = [c for c in table.columns if not c.startswith("t_") and not c.endswith("_weighted")]
         for k, name in enumerate(plain):
             share = 100.0 * table[name].to_numpy()
@@ -191,7 +169,13 @@ def cross(rec: Recording, fig: Figure) -> None:
             ax.plot(t, share, ".", markersize=1.5, alpha=0.4, color=color)
             ax.plot(t, running_mean(t, share, 1.0), linewidth=1.2, color=color, label=label)
         ax.set_ylim(-5.0, 105.0)
-        _dress(ax, printable(run), f"{TIME}; line: mean over 1 s", "foreign rows (%)", ncols=2)
+        dress(
+            ax,
+            printable(run),
+            f"{TIME}; line: mean over 1 s",
+            "foreign rows (%)",
+            legend={**ABOVE, "ncols": 2},
+        )
 
 
 def running_mean(t: Floats, values: Floats, width_s: float) -> Floats:
@@ -213,7 +197,7 @@ def rmse(rec: Recording, fig: Figure) -> None:
             if metric.startswith("rmse_deg."):
                 errors.setdefault(metric.partition(".")[2], {})[run.run] = float(value)
     if not errors:
-        raise _nothing(rec, "joint angle or attitude with a reference")
+        raise nothing(rec, "no joint angle or attitude with a reference")
     owners = list(dict.fromkeys(run for values in errors.values() for run in values))
     fig.set_size_inches(max(6.0, 1.2 * len(errors) * max(1, len(owners)) ** 0.5 + 3.0), 4.6)
     ax, width = fig.subplots(), 0.8 / len(owners)
@@ -224,11 +208,11 @@ def rmse(rec: Recording, fig: Figure) -> None:
             np.array(places) + (i - 0.5 * (len(owners) - 1)) * width,
             height,
             0.92 * width,
-            color=_color(rec, run),
+            color=run_color(rec, run),
             label=printable(run),
         )
         ax.bar_label(bars, fmt="%.2f", fontsize=7)
     ax.set_xticks(range(len(errors)), [printable(n).replace("_", "\n") for n in errors])
-    _dress(ax, "RMSE to the reference, bias included, after 1.2 s", "", "°")
+    dress(ax, "RMSE to the reference, bias included, after 1.2 s", "", "°", legend=ABOVE)
     ax.set_xlabel("angle", fontsize=9)
     ax.margins(y=0.2)

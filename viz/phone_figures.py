@@ -16,6 +16,7 @@ from ..replay.source_stages import source_stages
 from . import style
 from .canvas import is_estimate
 from .floor import loaders_of
+from .panels import TIME, dress, nothing, seconds
 from .shapes import ELLIPSE95, geo_circle, metres_a_degree
 from .text import printable
 from .thinned import first_rows
@@ -31,18 +32,7 @@ SHOWN_S = 14.0
 """Time that the detector's panels show: about 25 steps, so that single peaks are seen."""
 MOST_ELLIPSES = 25
 PEAK, VALLEY, LIMIT = "#D55E00", "#0072B2", "#009E73"
-GRID = {"color": "#DDDDDD", "linewidth": 0.6}
-
-
-def _dress(ax: Axes, title: str, x: str, y: str) -> None:
-    ax.set_title(title, fontsize=10, loc="left")
-    ax.set_xlabel(x, fontsize=9)
-    ax.set_ylabel(y, fontsize=9)
-    ax.tick_params(labelsize=8)
-    ax.grid(**GRID)
-    ax.set_axisbelow(True)
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(fontsize=8, loc="upper right", ncols=2)
+CORNER = {"loc": "upper right", "ncols": 2}
 
 
 def detector(rec: Recording, fig: Figure) -> None:
@@ -53,9 +43,9 @@ def detector(rec: Recording, fig: Figure) -> None:
         if c.schema == "sensor_msgs/msg/Imu" and "acc_x" in c.columns and c.count and role_of(t) == "raw"
     ]
     if not topics:
-        raise UsageError(f"{rec.path}: nothing for this figure: no accelerometer")
+        raise nothing(rec, "no accelerometer")
     table, whole = first_rows(rec, topics[0])
-    t = (table["t_ns"].to_numpy() - (rec.start_ns or 0)) / 1e9
+    t = seconds(rec, table["t_ns"])
     norm = np.linalg.norm(table.select("acc_x", "acc_y", "acc_z").to_numpy(), axis=1)
     s = source_stages(t, norm)
     first = t[s.steps[len(s.steps) // 4]] if len(s.steps) else t[0]
@@ -87,7 +77,7 @@ def detector(rec: Recording, fig: Figure) -> None:
                 ax.plot(t[inside], norm[inside], mark, color=color, markersize=5, linestyle="", label=name)
         low_y, high_y = float(norm[shown].min()), float(norm[shown].max())
         ax.set_ylim(low_y - 0.06 * (high_y - low_y), high_y + 0.35 * (high_y - low_y))  # room for the legend
-        _dress(ax, f"{printable(topics[0])}: {title}", "time since the start (s)", "m/s²")
+        dress(ax, f"{printable(topics[0])}: {title}", TIME, "m/s²", legend=CORNER)
 
 
 def transform(rec: Recording, fig: Figure) -> None:
@@ -96,7 +86,7 @@ def transform(rec: Recording, fig: Figure) -> None:
         t for t, c in rec.channels.items() if {"rotation_rad", "shift_east_m"} <= set(c.columns) and c.count
     ]
     if not topics:
-        raise UsageError(f"{rec.path}: nothing for this figure: no transform (estimator phone.transform)")
+        raise nothing(rec, "no transform (estimator phone.transform)")
     run = topics[0].split("/")[2]
     inputs = json.loads(rec.metadata.get(f"run/{run}", {}).get("inputs", "{}"))
     if not inputs.get("pose") or not inputs.get("gnss"):
@@ -139,7 +129,7 @@ def transform(rec: Recording, fig: Figure) -> None:
             ax.plot(*fixes.T, "s", color=style.DEVICE, markersize=5, linestyle="", label="fixes")
             ax.plot(*np.stack((positions, fixes), axis=2).transpose(1, 2, 0), color="#999999", linewidth=0.7)
         frame = f"UTM zone {int(about['zone'])}, about the fixes' mean" if k == 3 else "local"
-        _dress(ax, title, f"east, {frame} (m)", "north (m)")
+        dress(ax, title, f"east, {frame} (m)", "north (m)", legend=CORNER)
         ax.set_aspect("equal", adjustable="datalim")
 
 
@@ -168,7 +158,7 @@ def street_map(rec: Recording, fig: Figure) -> None:
         ).height
     }
     if not tables:
-        raise UsageError(f"{rec.path}: nothing for this figure: no fixes")
+        raise nothing(rec, "no fixes")
     fig.set_size_inches(10.0, 9.0)
     ax, under = fig.subplots(), map_underlay(loaders_of(rec))
     points = np.concatenate([t.select("lon_deg", "lat_deg").to_numpy() for t in tables.values()])
@@ -208,7 +198,7 @@ def street_map(rec: Recording, fig: Figure) -> None:
     ax.set_xlim(low[0] - pad, high[0] + pad)
     ax.set_ylim(low[1] - pad, high[1] + pad)
     ax.set_aspect(1.0 / np.cos(np.radians(low[1])))
-    _dress(ax, "on the map (ellipses: 95 %)", "longitude (°)", "latitude (°)")
+    dress(ax, "on the map (ellipses: 95 %)", "longitude (°)", "latitude (°)", legend=CORNER)
     ax.ticklabel_format(useOffset=False)
     ax.tick_params(axis="x", rotation=20)
 

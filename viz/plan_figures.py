@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..recording import Recording
-from ..recording.errors import UsageError
 from . import style
 from .canvas import is_estimate
 from .floor import FloorPlan, plan_of
+from .panels import nothing
 from .shapes import ELLIPSE95, circle
 from .text import printable
 from .trace import Trace
@@ -73,15 +73,11 @@ def runs_with(rec: Recording, output: str) -> list[str]:
     ]
 
 
-def _nothing(rec: Recording, what: str) -> UsageError:
-    return UsageError(f"{rec.path}: nothing for this figure: {what}")
-
-
 def anchors(rec: Recording, fig: Figure) -> None:
     """Floor plan with the anchors by technology and the distances between them."""
     plan = plan_of(rec)
     if not plan.anchors:
-        raise _nothing(rec, "no anchor table")
+        raise nothing(rec, "no anchor table")
     fig.set_size_inches(10.0, 6.5)
     ax = fig.subplots()
     pairs = [
@@ -173,7 +169,7 @@ def triples(rec: Recording, fig: Figure) -> None:
     """Solutions of each three anchors in a window with their mean, the ranges' circles, and the true position."""
     runs = runs_with(rec, "triples")
     if not runs:
-        raise _nothing(rec, "no run with triples (indoor.trilateration, indoor.hybrid)")
+        raise nothing(rec, "no run with triples (indoor.trilateration, indoor.hybrid)")
     run, plan, truth = runs[0], plan_of(rec), true_positions(rec)
     solutions, ranged = rec.table(f"{run}/triples"), rec.table(f"{run}/corrected")
     times = np.unique(solutions["t_ns"].to_numpy())
@@ -214,13 +210,13 @@ def points(rec: Recording, fig: Figure) -> None:
     """Fixes of each run about the true points at which somebody stood, with their mean errors."""
     truth, plan = true_positions(rec), plan_of(rec)
     if truth is None:
-        raise _nothing(rec, "no true positions")
+        raise nothing(rec, "no true positions")
     stays = _stays(truth)
     runs = [r for r in runs_with(rec, "position") if f"{r}/ranges" in rec.channels] or runs_with(
         rec, "position"
     )
     if not stays or not runs:
-        raise _nothing(rec, "nobody stood at a point, or no run has positions")
+        raise nothing(rec, "nobody stood at a point, or no run has positions")
     fig.set_size_inches(13.0, 4.6 * len(runs))
     axes = np.ravel(fig.subplots(len(runs), 1, squeeze=False))
     low, high = _frame(plan, 3.0)
@@ -273,7 +269,7 @@ def particles(rec: Recording, fig: Figure) -> None:
     """Cloud of a particle filter at moments of the run, with its 95 % ellipse, the track so far and the truth."""
     runs = runs_with(rec, "particles")
     if not runs:
-        raise _nothing(rec, "no run with particles (indoor.fused)")
+        raise nothing(rec, "no run with particles (indoor.fused)")
     run, plan, truth = runs[0], plan_of(rec), true_positions(rec)
     cloud, track, stated = (rec.table(f"{run}/{name}") for name in ("particles", "position", "sigma"))
     times = np.unique(cloud["t_ns"].to_numpy())

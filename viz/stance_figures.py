@@ -10,10 +10,10 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ..recording import Recording
-from ..recording.errors import UsageError
 from ..replay.trajectory import stances_of
 from . import style
 from .canvas import is_estimate
+from .panels import TIME, dress, nothing, seconds
 from .text import printable
 from .thinned import pieces
 
@@ -52,9 +52,7 @@ def conditions(rec: Recording, fig: Figure) -> None:
         ):
             runs.setdefault(channel.metadata["detector"], (topic, stance))
     if not runs:
-        raise UsageError(
-            f"{rec.path}: nothing for this figure: no stance detector; replay a foot estimator first"
-        )
+        raise nothing(rec, "no stance detector; replay a foot estimator first")
     tables = {name: _shown(rec, values, stance) for name, (values, stance) in runs.items()}
     heights = [h for both in tables.values() for h in [*([1.0] * len(statistics_of(both.columns))), 1.5]]
     fig.set_size_inches(10.0, 1.0 + 1.7 * sum(heights))
@@ -116,7 +114,7 @@ def _detector(
     metadata: dict[str, str],
     rec: Recording,
 ) -> None:
-    t = (both["t_ns"].to_numpy() - (rec.start_ns or 0)) / 1e9
+    t = seconds(rec, both["t_ns"])
     still = both["still"].cast(pl.Boolean).to_numpy()
     lanes: list[tuple[str, Bools]] = []
     for statistic in statistics_of(both.columns):
@@ -147,7 +145,8 @@ def _detector(
         if high is not None and "threshold" not in both.columns:
             ax.set_ylim(min(0.0, float(np.nanmin(x))), max(4.0 * high if low is None else 2.5 * high, 1e-9))
         _boxes(ax, t, still)
-        _dress(ax, f"{run}: {statistic} (detector {name}); grey: stance", UNITS.get(statistic, ""))
+        title = f"{run}: {statistic} (detector {name}); grey: stance"
+        dress(ax, title, "", UNITS.get(statistic, ""), legend={"loc": "upper right"})
         lanes.append((statistic, condition(statistic, both, metadata)))
     every = np.logical_and.reduce([met for _, met in lanes])
     lanes += [("all of them", every)] if len(lanes) > 1 else []
@@ -158,8 +157,7 @@ def _detector(
         ax.fill_between(t, k, k + 0.75 * met, step="mid", color=colour, linewidth=0)
     ax.set_yticks([k + 0.4 for k in range(len(lanes))], [label for label, _ in reversed(lanes)], fontsize=8)
     ax.set_ylim(-0.2, len(lanes))
-    _dress(ax, f"{run}: each condition as 0 or 1, and what came of them", "", legend=False)
-    ax.set_xlabel("time since the start (s)", fontsize=9)
+    dress(ax, f"{run}: each condition as 0 or 1, and what came of them", TIME, "", legend=None)
 
 
 def _number(metadata: Mapping[str, str], key: str) -> float | None:
@@ -170,13 +168,3 @@ def _boxes(ax: Axes, t: NDArray[np.float64], still: Bools) -> None:
     edges = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
     for a, b in zip(edges[::2], edges[1::2], strict=True):
         ax.axvspan(float(t[a]), float(t[min(b, len(t) - 1)]), color="#000000", alpha=0.08, linewidth=0)
-
-
-def _dress(ax: Axes, title: str, unit: str, *, legend: bool = True) -> None:
-    ax.set_title(title, fontsize=10, loc="left")
-    ax.set_ylabel(unit, fontsize=9)
-    ax.tick_params(labelsize=8)
-    ax.grid(color="#DDDDDD", linewidth=0.6)
-    ax.set_axisbelow(True)
-    if legend:
-        ax.legend(fontsize=8, loc="upper right")

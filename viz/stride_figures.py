@@ -10,12 +10,12 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ..recording import Recording
-from ..recording.errors import UsageError
 from ..replay.metrics import BETWEEN
 from ..replay.metrics_joint import JOINT_STATE, cycles_of, joint_columns, starts_from_signal
 from ..replay.trajectory import inside, joined
 from . import style
 from .canvas import is_estimate
+from .panels import dress, nothing
 from .text import printable
 from .views.base import role_of
 
@@ -124,7 +124,7 @@ def strides_by(rec: Recording, fig: Figure, tier: pl.DataFrame) -> None:
 
 def _draw(rec: Recording, fig: Figure, curves: list[Cycles]) -> None:
     if not curves:
-        raise UsageError(f"{rec.path}: nothing for this figure: no joint with {LEAST} cycles of gait")
+        raise nothing(rec, f"no joint with {LEAST} cycles of gait")
     by_label = any(c.label for c in curves)
     rows = list(dict.fromkeys(c.base for c in curves))
     owners = list(dict.fromkeys(c.owner for c in curves)) if by_label else [""]
@@ -144,12 +144,7 @@ def _draw(rec: Recording, fig: Figure, curves: list[Cycles]) -> None:
                 name = " ".join(w for w in (c.label if by_label else c.owner, c.side) if w)
                 _band(ax, c.curves, colours[key], f"{printable(name)}: {len(c.curves)} cycles", reference)
             title = f"{printable(base)}{f' of {printable(owner)}' if owner else ''}"
-            ax.set_title(title, fontsize=10, loc="left")
-            ax.set_xlabel("gait cycle (%), from maximum to maximum of the angle", fontsize=9)
-            ax.set_ylabel("angle (°)", fontsize=9)
-            ax.tick_params(labelsize=8)
-            ax.grid(color="#DDDDDD", linewidth=0.6)
-            ax.legend(fontsize=8, loc="best")
+            dress(ax, title, "gait cycle (%), from maximum to maximum of the angle", "angle (°)")
 
 
 def _band(ax: Axes, curves: Floats, color: str, label: str, dashed: bool) -> None:
