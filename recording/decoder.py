@@ -18,6 +18,8 @@ from .codec import SECOND, Binding, Columns, Messages
 from .definitions import Library
 from .schemas import TECHNOLOGIES, Schema
 
+STAMP = frozenset({"header.stamp.sec", "header.stamp.nanosec"})
+"""Fields of a foreign message that are its time, where both are there."""
 _EXPAND = 64
 """Longest fixed array of a foreign message that becomes one column an element."""
 
@@ -109,7 +111,7 @@ class BoundLayout:
         constants: list[str] = [schema.frame if schema else "header.frame_id"]
         if schema is None:
             self.rows.append(_flatten(layout))
-            self.stamps.append("header.stamp" if "header.stamp.sec" in (layout.dtype.names or ()) else None)
+            self.stamps.append("header.stamp" if set(layout.dtype.names or ()) >= STAMP else None)
         elif schema.explode:
             for k in range(layout.sequences[schema.explode]):
                 root = f"{schema.explode}[{k}]."
@@ -198,6 +200,7 @@ def _flatten(layout: Layout) -> list[Binding]:
     """Return one column a leaf of a message that marcha has no schema for."""
     fields = layout.dtype.fields or {}
     bindings: list[Binding] = []
+    own = {"#", "header.frame_id"} | (STAMP if fields.keys() >= STAMP else frozenset())
     for path, (format_, *_) in fields.items():
         if path.endswith("#"):
             sequence = path[:-1]
@@ -206,7 +209,7 @@ def _flatten(layout: Layout) -> list[Binding]:
             elif sequence in layout.counts and sequence not in layout.sequences and sequence not in fields:
                 bindings.append(Binding(sequence, "text", sequence))
             continue
-        if path in ("#", "header.stamp.sec", "header.stamp.nanosec", "header.frame_id"):
+        if path in own:
             continue
         if path.endswith(".nanosec") and path[:-8] + ".sec" in fields:
             continue

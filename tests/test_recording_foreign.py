@@ -200,6 +200,15 @@ def test_a_type_of_the_same_name_with_other_fields_is_taken_as_it_is(tmp_path):
     assert table.to_dicts() == [{"t_ns": 7, "when_ns": 10**9 + 2, "acceleration": 3.0}]
 
 
+def test_half_a_stamp_is_a_column_and_no_time(tmp_path):
+    text = "Top header\nfloat64 x\n" + "=" * 80 + "\nMSG: pkg/Top\nStamp stamp\n" + "=" * 80
+    text += "\nMSG: pkg/Stamp\nint32 sec\n"
+    library = parse_full("pkg/msg/Half", text)
+    data = encode({"header": {"stamp": {"sec": 3}}, "x": 0.5}, library["pkg/Half"], library)
+    path = raw_writer(tmp_path / "a.mcap", [("/half", 7, data)], ("/half",), "pkg/msg/Half", text)
+    assert mr.open(path).table("/half").to_dicts() == [{"t_ns": 7, "header.stamp.sec": 3.0, "x": 0.5}]
+
+
 def test_a_json_channel_is_listed_and_skipped_with_a_finding(tmp_path):
     table = imu(5)
     with (tmp_path / "a.mcap").open("wb") as file:
