@@ -54,6 +54,7 @@ def _table(n: int) -> pl.DataFrame:
 def _columns(n: int) -> tuple[float, float]:
     import rerun as rr
     from marcha.replay import PlannedChannel
+    from marcha.viz.canvas import Canvas
     from marcha.viz.scene import Scene
     from marcha.viz.stream import new_stream
     from marcha.viz.timeaxis import TimeAxis
@@ -63,7 +64,7 @@ def _columns(n: int) -> tuple[float, float]:
     with tempfile.TemporaryDirectory() as folder:
         stream = new_stream()
         stream.set_sinks(rr.FileSink(Path(folder) / "x.rrd"))
-        scene = Scene(stream, [channel], TimeAxis())
+        scene = Scene(Canvas(stream, [channel], TimeAxis()))
         scene.begin()
         start = time.perf_counter()
         scene.write(TOPIC, table)

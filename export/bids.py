@@ -17,7 +17,7 @@ import polars as pl
 from ..recording import Recording
 from ..recording.errors import UsageError
 from ..recording.events import SIDECAR, TABLE, bids_events, events_text, sidecar, to_events
-from ..recording.names import free_name
+from ..recording.names import ESTIMATE, free_name
 from ..recording.selection import Selection, selected_topics, within
 from ..recording.threads import Prefetch
 from .facts import origin, pretty
@@ -25,7 +25,6 @@ from .folder import whole_folder
 from .tables import EVENT, meaning
 
 VERSION = "1.9.0"
-ESTIMATE = "/estimate/"
 MARKER = "dataset_description.json"
 KNOWN_AT = "t_log_ns"
 _EPOCH_NS = 946_684_800 * 10**9

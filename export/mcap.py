@@ -17,14 +17,13 @@ from ..recording import (
 )
 from ..recording.errors import MarchaError
 from ..recording.events import SIDECAR, TABLE
-from ..recording.names import free_name
+from ..recording.names import ESTIMATE, free_name
 from ..recording.selection import Selection, selected_topics, within
 from .pointclouds import add_tracks
 from .rules import by_rules
 from .series import evenly
 
 EVENT = "foxglove_msgs/msg/Event"
-ESTIMATE = "/estimate/"
 
 
 class McapOptions(Selection, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from ..recording import Recording
 from ..recording.annotations import COLUMNS, check_annotations, identified
 from ..recording.errors import UsageError
+from ..recording.names import ESTIMATE
 from ..recording.selection import Selection
 
 STANCE = "marcha_msgs/msg/Stance"
 STEP = "marcha_msgs/msg/Step"
 FIX = "sensor_msgs/msg/NavSatFix"
 IMU = "sensor_msgs/msg/Imu"
-ESTIMATE = "/estimate/"
 Times = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 

@@ -11,6 +11,7 @@ import polars as pl
 from .annotations import TOPIC
 from .errors import Finding
 from .integrity import structure
+from .names import ESTIMATE
 
 if TYPE_CHECKING:
     from .model import Channel
@@ -30,8 +31,6 @@ SAMPLED = frozenset(
 
 GAP_S, GAP_INTERVALS = 0.2, 5
 """A gap is longer than this, and than so many median intervals; the replay engine draws the same line."""
-
-ESTIMATE = "/estimate/"
 
 
 def check(rec: Recording) -> list[Finding]:

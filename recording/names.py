@@ -1,6 +1,14 @@
-"""Names that are no other's: of metadata records, runs, columns."""
+"""Names in a recording: topics of what runs write, and names that are no other's."""
 
 from __future__ import annotations
+
+ESTIMATE = "/estimate/"
+"""Beginning of the topics that runs write."""
+
+
+def is_estimate(topic: str) -> bool:
+    """Return whether a topic is a run's output, ``/estimate/<run>/<what>``."""
+    return topic.startswith(ESTIMATE) and topic.count("/") >= 3
 
 
 def free_name(name: str, taken: set[str]) -> str:

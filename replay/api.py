@@ -14,6 +14,7 @@ from ..recording import Recording
 from ..recording import open as open_recording
 from ..recording.errors import OutputExists, UsageError
 from ..recording.files import require_other
+from ..recording.names import is_estimate
 from ..recording.provenance import hash_file
 from ..recording.threads import give_back_memory
 from .clock import Clock
@@ -123,7 +124,7 @@ def replay(
             surveyed(survey)
         truth_of(rec.metadata)  # what cannot be measured against is said before anything is written
     taken = [n.removeprefix("run/") for n in rec.metadata if n.startswith("run/")] if rec is not None else []
-    taken += {t.split("/")[2] for t in source.channels if t.startswith("/estimate/") and t.count("/") > 2}
+    taken += {t.split("/")[2] for t in source.channels if is_estimate(t)}
     runs = plan_runs(source, estimators, params, inputs, taken, calibrations)
     tables = TableSink() if keep_tables else None
     own: list[Sink] = [

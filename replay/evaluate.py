@@ -13,6 +13,7 @@ import polars as pl
 
 from ..recording import Recording
 from ..recording.errors import MarchaError, UsageError
+from ..recording.names import is_estimate
 from .alignment import IntArray, on_a_plan
 from .gaitcycles import JointCycles, cycles
 from .metrics import available_metrics
@@ -195,7 +196,7 @@ def evaluate(
     """
     lineages = {n.removeprefix("run/"): m for n, m in rec.metadata.items() if n.startswith("run/")}
     for topic in rec.channels:  # estimates of others' tools have no record
-        if topic.startswith("/estimate/") and topic.count("/") > 2:
+        if is_estimate(topic):
             lineages.setdefault(topic.split("/")[2], {})
     if not lineages:
         raise MarchaError(f"{rec.path}: has no estimates; run `marcha replay` first")

@@ -16,6 +16,7 @@ import polars as pl
 import rerun as rr
 from numpy.typing import NDArray
 
+from ..recording.names import is_estimate
 from ..replay.alignment import on_a_plan
 from ..replay.references import shown_reference
 from . import style
@@ -402,11 +403,6 @@ def entity(path: str) -> str:
         return path.rstrip("/") if "//" not in path else "/" + "/".join(p for p in path.split("/") if p)
     parts = [rr.escape_entity_path_part(printable(p)) for p in path.split("/") if p]
     return ("/" if path.startswith("/") else "") + "/".join(parts)
-
-
-def is_estimate(topic: str) -> bool:
-    """Return whether a topic is a run's output, ``/estimate/<run>/<what>``."""
-    return topic.startswith("/estimate/") and topic.count("/") >= 3
 
 
 def is_raw(topic: str) -> bool:

@@ -15,10 +15,11 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ..recording import Recording
+from ..recording.names import is_estimate
 from ..replay.evaluate import evaluate
 from ..replay.references import shown_reference
 from . import indoor_figures, joint_figures, plan_figures, style
-from .canvas import PLACES, is_estimate
+from .canvas import PLACES
 from .curve import Curve
 from .floor import Anchor, plan_of
 from .panels import TIME, dress, nothing, run_color, seconds

@@ -55,7 +55,7 @@ def draw(
     prefixes = [""] if len(recs) == 1 else prefixes_of(recs)
     scenes: list[Scene] = []
     for rec, chosen, axis, prefix in zip(recs, topics, axes_of(recs), prefixes, strict=True):
-        scene = Scene(
+        canvas = Canvas(
             stream,
             [rec.channels[t] for t in chosen],
             axis,
@@ -64,6 +64,7 @@ def draw(
             metadata=rec.metadata,
             attachments=loaders_of(rec),
         )
+        scene = Scene(canvas)
         scene.begin()
         for window in rec.windows(chosen, start_ns=selection.start_ns, end_ns=selection.end_ns):
             for topic, table in window.tables.items():
@@ -72,12 +73,12 @@ def draw(
         if annotating:
             scene.lanes.show()
         scene.end()
-        if scene.canvas.plan.anchors:
-            draw_figures(scene.canvas, rec)
+        if canvas.plan.anchors:
+            draw_figures(canvas, rec)
         metrics = measured(rec)
         send_facts(stream, rec, metrics, prefix)
         text = rr.TextDocument(report(rec, metrics), media_type=rr.MediaType.MARKDOWN)
-        scene.canvas.static(f"{scene.canvas.prefix}/report", text)
+        canvas.static(f"{canvas.prefix}/report", text)
         scenes.append(scene)
     canvases = [scene.canvas for scene in scenes]
     log_top_view(stream, *extent(canvases))

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ..recording import Recording
 from ..recording.errors import UsageError
+from ..recording.names import is_estimate
 from . import style
-from .canvas import is_estimate
 from .floor import plan_of
 from .panels import nothing, seconds
 from .plan_figures import draw_floor, true_positions

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..recording import Recording
+from ..recording.names import is_estimate
 from ..replay.evaluate import evaluate
 from . import style
-from .canvas import is_estimate
 from .panels import TIME, dress, nothing, run_color, seconds
 from .text import printable
 from .views.common import EULER, euler_deg

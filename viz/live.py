@@ -232,20 +232,17 @@ class LiveSink(Sink):
     def _begun(self, t_ns: int) -> Scene:
         """Return the scene; where time begins is known with the first message."""
         from .blueprint import blueprint, extent
+        from .canvas import Canvas
         from .scene import Scene
         from .stream import send_blueprint
         from .timeaxis import axis_from
         from .top_view import log_top_view
 
         if self._scene is None:
-            self._scene = Scene(
-                self._stream,
-                self._plan.channels.values(),
-                axis_from(t_ns),
-                metadata={f"run/{r.run}": {"input": r.input} for r in self._plan.runs},
-            )
+            runs = {f"run/{r.run}": {"input": r.input} for r in self._plan.runs}
+            canvas = Canvas(self._stream, self._plan.channels.values(), axis_from(t_ns), metadata=runs)
+            self._scene = Scene(canvas)
             self._scene.begin()
-            canvas = self._scene.canvas
             log_top_view(self._stream, *extent([canvas]))  # 10 m by 10 m until more is known
             send_blueprint(self._stream, blueprint([canvas], live=True))
         return self._scene

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ..recording import Recording
 from ..recording.errors import UsageError
+from ..recording.names import is_estimate
 from . import style
-from .canvas import is_estimate
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

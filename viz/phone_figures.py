@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from ..recording import Recording
 from ..recording.errors import UsageError
+from ..recording.names import is_estimate
 from ..replay.metrics_place import stated_covariances
 from ..replay.source_stages import source_stages
 from . import style
-from .canvas import is_estimate
 from .floor import loaders_of
 from .panels import TIME, dress, nothing, seconds
 from .shapes import ELLIPSE95, geo_circle, metres_a_degree

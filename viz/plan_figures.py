@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..recording import Recording
+from ..recording.names import is_estimate
 from . import style
-from .canvas import is_estimate
 from .floor import FloorPlan, plan_of
 from .panels import nothing
 from .shapes import ELLIPSE95, circle

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from ..recording import Recording
 from ..recording import open as open_recording
 from ..recording.errors import MarchaError
+from ..recording.names import is_estimate
 from ..replay import Evaluation, ReplayResult, RunEvaluation, evaluate
-from .canvas import is_estimate
 from .text import printable
 
 LONGEST = 120

@@ -9,24 +9,19 @@ Estimates stand at the time that they speak of, not at the time when they were k
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-
 import polars as pl
 import rerun as rr
 
 from . import style
 from .annotation_lanes import AnnotationLanes
 from .canvas import (
-    ALIGNMENT,
     COMPARE,
     OVERVIEW,
     REPORT,
     Canvas,
-    ChannelLike,
 )
 from .registry import views_of, warn
 from .report import verdicts
-from .timeaxis import TimeAxis
 from .trace import axes_error, compared, distance
 from .views.base import View
 from .views.common import General
@@ -41,33 +36,21 @@ class Scene:
 
     Parameters
     ----------
-    stream, channels, axis, prefix, first_color, alignment, metadata, attachments
-        See :class:`marcha.viz.canvas.Canvas`.
+    canvas : Canvas
+        Where everything is drawn.
 
     Attributes
     ----------
-    canvas : Canvas
-        Where everything is drawn.
     lanes : AnnotationLanes
         Annotations that are drawn.
     views : dict of str to list of View
         The views of each topic.
     """
 
-    def __init__(
-        self,
-        stream: rr.RecordingStream,
-        channels: Iterable[ChannelLike],
-        axis: TimeAxis,
-        prefix: str = "",
-        first_color: int = 0,
-        alignment: str = ALIGNMENT,
-        metadata: Mapping[str, Mapping[str, str]] | None = None,
-        attachments: Mapping[str, Callable[[], bytes]] | None = None,
-    ) -> None:
-        self.canvas = Canvas(stream, channels, axis, prefix, first_color, alignment, metadata, attachments)
-        self.lanes = AnnotationLanes(self.canvas)
-        self.views = {c.topic: views_of(self.canvas, c) for c in self.canvas.channels}
+    def __init__(self, canvas: Canvas) -> None:
+        self.canvas = canvas
+        self.lanes = AnnotationLanes(canvas)
+        self.views = {c.topic: views_of(canvas, c) for c in canvas.channels}
         self._failed: set[View] = set()
 
     def begin(self) -> None:

@@ -10,9 +10,9 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ..recording import Recording
+from ..recording.names import is_estimate
 from ..replay.trajectory import stances_of
 from . import style
-from .canvas import is_estimate
 from .panels import TIME, dress, nothing, seconds
 from .text import printable
 from .thinned import pieces

@@ -10,11 +10,11 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ..recording import Recording
+from ..recording.names import is_estimate
 from ..replay.metrics import BETWEEN
 from ..replay.metrics_joint import JOINT_STATE, cycles_of, joint_columns, starts_from_signal
 from ..replay.trajectory import inside, joined
 from . import style
-from .canvas import is_estimate
 from .panels import dress, nothing
 from .text import printable
 from .views.base import role_of

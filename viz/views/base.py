@@ -27,7 +27,8 @@ from typing import ClassVar, Literal
 
 import polars as pl
 
-from ..canvas import Canvas, ChannelLike, Times, is_estimate
+from ...recording.names import is_estimate
+from ..canvas import Canvas, ChannelLike, Times
 
 Role = Literal["raw", "estimate", "reference", "annotation"]
 
