@@ -15,19 +15,19 @@ import msgspec
 import polars as pl
 
 from ..recording import Recording
+from ..recording.annotations import EVENT
 from ..recording.errors import UsageError
 from ..recording.events import SIDECAR, TABLE, bids_events, events_text, sidecar, to_events
 from ..recording.names import ESTIMATE, free_name
 from ..recording.selection import Selection, selected_topics, within
 from ..recording.threads import Prefetch
-from .facts import origin, pretty
+from .facts import FIRST_DATE_NS, origin, pretty
 from .folder import whole_folder
-from .tables import EVENT, meaning
+from .tables import meaning
 
 VERSION = "1.9.0"
 MARKER = "dataset_description.json"
 KNOWN_AT = "t_log_ns"
-_EPOCH_NS = 946_684_800 * 10**9
 _KINDS = {"acc": "ACCEL", "gyr": "GYRO", "mag": "MAGN", "quat": "ORNT", "pos": "POS", "vel": "VEL"}
 _UNITS = {"m/s²": "m/s^2", "°": "deg", "°C": "oC", "-": "n/a", "": "n/a", "as named": "n/a", "Pa": "Pa"}
 _COUNTED = ("ACCEL", "GYRO", "MAGN", "ORNT", "POS", "VEL", "JNTANG", "LATENCY", "MISC")
@@ -271,7 +271,7 @@ def _write_recording(files: _Files, rec: Recording, options: BidsOptions, about:
 
 
 def _date(rec: Recording) -> str:
-    if rec.start_ns < _EPOCH_NS:
+    if rec.start_ns < FIRST_DATE_NS:
         return "n/a"
     whole, rest = divmod(rec.start_ns, 10**9)
     return datetime.fromtimestamp(whole, UTC).strftime("%Y-%m-%dT%H:%M:%S") + f".{rest // 1000:06d}Z"

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from ..recording import Recording
+from ..recording.annotations import EVENT
 from ..recording.errors import UsageError
 from ..recording.scratch import scratch_folder
 from ..recording.selection import Selection, selected_topics, within
@@ -16,7 +17,7 @@ from .facts import origin, pretty
 from .files import write_files
 from .opensim import MARKERS
 from .series import Floats, Together, evenness, rate_hz, together
-from .tables import EVENT, meaning
+from .tables import meaning
 
 EVEN = 0.01
 """Intervals may differ by this share before a channel counts as uneven."""

@@ -10,6 +10,9 @@ import msgspec
 from ..recording import Recording
 from ..recording.provenance import hash_file
 
+FIRST_DATE_NS = 946_684_800 * 10**9
+"""2000-01-01: clocks before it do not tell the date."""
+
 
 def origin(rec: Recording) -> dict[str, Any]:
     """Return the tool, the recording with its hash, and what a time of zero stands for."""

@@ -12,13 +12,13 @@ import numpy as np
 import polars as pl
 
 from ..recording import Recording
-from ..recording.annotations import COLUMNS
+from ..recording.annotations import COLUMNS, EVENT
 from ..recording.errors import MarchaError
 from ..recording.events import SIDECAR, TABLE
 from ..recording.selection import Selection, selected_topics, within
 from .facts import origin
 from .files import write_files
-from .tables import EVENT, meaning
+from .tables import meaning
 
 MOST = 2**31 - 2**20
 """Bytes of one variable that the format holds."""

@@ -15,6 +15,7 @@ from ..recording import (
     Writer,
     create,
 )
+from ..recording.annotations import EVENT
 from ..recording.errors import MarchaError
 from ..recording.events import SIDECAR, TABLE
 from ..recording.names import ESTIMATE, free_name
@@ -22,8 +23,6 @@ from ..recording.selection import Selection, selected_topics, within
 from .pointclouds import add_tracks
 from .rules import by_rules
 from .series import evenly
-
-EVENT = "foxglove_msgs/msg/Event"
 
 
 class McapOptions(Selection, frozen=True, kw_only=True, forbid_unknown_fields=True):

@@ -14,6 +14,7 @@ import msgspec
 import polars as pl
 
 from ..recording import SCHEMAS, Channel, Recording
+from ..recording.annotations import EVENT
 from ..recording.events import COLUMNS as EVENT_COLUMNS
 from ..recording.events import events_text, sidecar, to_events
 from ..recording.selection import Selection, selected_topics, within
@@ -21,7 +22,6 @@ from ..recording.threads import Prefetch
 from .facts import pretty
 from .folder import MARKER, whole_folder
 
-EVENT = "foxglove_msgs/msg/Event"
 EVENTS, EVENTS_JSON = "events.tsv", "events.json"
 README = "README.txt"
 COMMON_COLUMNS = {

@@ -18,12 +18,10 @@ from numpy.typing import NDArray
 from ..recording import Recording
 from ..recording.errors import UsageError
 from ..recording.selection import Selection, selected_topics
-from .facts import origin
+from .facts import FIRST_DATE_NS, origin
 from .files import write_files
 
 FIX = "sensor_msgs/msg/NavSatFix"
-_EPOCH_NS = 946_684_800 * 10**9
-"""2000-01-01: clocks before it do not tell the date."""
 _DEG_M = 111_319.5
 """Metres of a degree of latitude, near enough for privacy."""
 _SD = ("sd_east_m", "sd_north_m", "sd_up_m")
@@ -66,7 +64,7 @@ def tracks_of(rec: Recording, options: TrackOptions) -> list[FixTrack]:
         table = rec.table(topic, start_ns=options.start_ns, end_ns=options.end_ns)
         table = table.filter(pl.col("lat_deg").is_finite() & pl.col("lon_deg").is_finite())
         table = _private(table, options)
-        dated = table.height and int(table["t_ns"][0]) > _EPOCH_NS
+        dated = table.height and int(table["t_ns"][0]) > FIRST_DATE_NS
         out.append(FixTrack(topic, table, [_iso(t) for t in table["t_ns"].to_list()] if dated else None))
     if not any(track.table.height for track in out):
         raise UsageError(f"{rec.path}: no fixes are left to write; choose topics of {FIX}, or less privacy")

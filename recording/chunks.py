@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from .checksum import crc32
-from .codec import PREFIX, Messages
+from .codec import INDEX_HEAD, PREFIX, RECORD_HEAD, Messages
 from .errors import MarchaError
 from .files import require_regular
 
@@ -28,9 +28,7 @@ LAST_NS = (1 << 63) - 1
 """Times beyond this (year 2262) are none: they do not fit the integers of tables."""
 
 
-_RECORD_HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQI")
-_INDEX_HEAD = struct.Struct("<BQHI")
 
 BROKEN = (McapError, struct.error, ValueError, UnicodeDecodeError, EOFError, MemoryError, OverflowError)
 """What mcap's records raise on bytes that are not theirs."""
@@ -235,7 +233,7 @@ def split(
         return {k: v for k, v in even.items() if wanted is None or k in wanted}
     raw, size, offset = data.data, len(data), 0
     rows: dict[int, tuple[list[int], list[int]]] = {}
-    unpack = _RECORD_HEAD.unpack_from
+    unpack = RECORD_HEAD.unpack_from
     while offset + 9 <= size:
         opcode, length = unpack(raw, offset)
         end = offset + 9 + length
@@ -310,13 +308,13 @@ def read_index(file: FileReader, ref: ChunkRef) -> dict[int, NDArray[np.int64]]:
     out: dict[int, NDArray[np.int64]] = {}
     offset = 0
     while offset < len(data):
-        if offset + _INDEX_HEAD.size > len(data):
+        if offset + INDEX_HEAD.size > len(data):
             raise ChunkError("a message index is cut short")
-        opcode, length, channel, size = _INDEX_HEAD.unpack_from(data, offset)
+        opcode, length, channel, size = INDEX_HEAD.unpack_from(data, offset)
         if opcode == Opcode.MESSAGE_INDEX:
-            if size % 16 or offset + _INDEX_HEAD.size + size > len(data):
+            if size % 16 or offset + INDEX_HEAD.size + size > len(data):
                 raise ChunkError("a message index has a wrong length")
-            out[channel] = np.frombuffer(data, "<u8", size // 8, offset + _INDEX_HEAD.size)[::2].astype(
+            out[channel] = np.frombuffer(data, "<u8", size // 8, offset + INDEX_HEAD.size)[::2].astype(
                 np.int64
             )
         offset += 9 + length

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +24,11 @@ PREFIX = np.dtype(
     ]
 )
 """What stands before the message in an MCAP message record: 31 bytes."""
+
+RECORD_HEAD = struct.Struct("<BQ")
+"""Opcode and length: what stands before every record."""
+INDEX_HEAD = struct.Struct("<BQHI")
+"""The same, channel and length of the entries: what stands before those of a message index."""
 
 SECOND = 1_000_000_000
 MAX_TIME_NS = 2**31 * SECOND - 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -26,7 +25,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from .checksum import crc32
 from .chunks import BROKEN, LAST_NS, ChunkError, ChunkRef, FileReader, read_chunk, split
-from .codec import PREFIX
+from .codec import PREFIX, RECORD_HEAD
 from .errors import Finding, MarchaError
 
 _RUN = 1 << 20
@@ -35,8 +34,6 @@ _RUN = 1 << 20
 
 UNINDEXED = "the summary has no chunk index"
 """Why a sound file is read from its start."""
-
-_RECORD_HEAD = struct.Struct("<BQ")
 
 
 _FOOTER_SIZE = 9 + 20
@@ -157,7 +154,7 @@ def _indexes_all(contents: Contents) -> bool:
 
 
 def _read_header(file: FileReader, contents: Contents) -> None:
-    opcode, length = _RECORD_HEAD.unpack(file.read(8, 9))
+    opcode, length = RECORD_HEAD.unpack(file.read(8, 9))
     if opcode == Opcode.HEADER:
         with contextlib.suppress(*BROKEN):  # nothing that is read depends on it
             header = Header.read(ReadDataStream(BytesIO(file.read(17, length))))
@@ -170,7 +167,7 @@ def _scan(file: FileReader, reason: str) -> Contents:
     counts: dict[int, int] = {}
     offset, ended, run = 8, False, None
     while offset + 9 <= file.size:
-        opcode, length = _RECORD_HEAD.unpack(file.read(offset, 9))
+        opcode, length = RECORD_HEAD.unpack(file.read(offset, 9))
         body, end = offset + 9, offset + 9 + length
         if end > file.size:
             break

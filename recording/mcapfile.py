@@ -38,6 +38,7 @@ from numpy.typing import NDArray
 from .atomic import AtomicFile
 from .cdr import Bytes
 from .checksum import crc32, crc32_behind
+from .codec import INDEX_HEAD, RECORD_HEAD
 from .errors import UsageError
 from .threads import helpers
 
@@ -261,9 +262,6 @@ class McapFile:
 
 _local = threading.local()
 _LENGTH = struct.Struct("<Q")
-_RECORD_HEAD = 9
-"""Bytes of opcode and length before every record."""
-_INDEX_HEAD = struct.Struct("<BQHI")
 
 
 def _compressor(level: int) -> zstandard.ZstdCompressor:
@@ -308,7 +306,7 @@ def pack(
     entries = np.ascontiguousarray(index, "<i8").reshape(-1).view(np.uint8).data
     return Packed(
         pieces,
-        (_INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(entries), channel_id, len(entries)), entries),
+        (INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(entries), channel_id, len(entries)), entries),
         {channel_id: (0, len(index))},
         first,
         last,
@@ -332,6 +330,6 @@ def seal(
     builder = RecordBuilder()
     Chunk(compression, b"", last_ns, first_ns, crc, len(raw)).write(builder)
     head = bytearray(builder.end())
-    _LENGTH.pack_into(head, 1, len(head) - _RECORD_HEAD + len(body))
+    _LENGTH.pack_into(head, 1, len(head) - RECORD_HEAD.size + len(body))
     _LENGTH.pack_into(head, len(head) - _LENGTH.size, len(body))
     return (bytes(head), body), compression

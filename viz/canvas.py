@@ -23,15 +23,11 @@ from . import style
 from .floor import FloorPlan
 from .text import printable
 from .timeaxis import TimeAxis
-from .trace import Trace
+from .trace import ALIGNMENT, Trace
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 Kind = Literal["plot", "lanes", "space", "map", "log", "document", "picture"]
-
-ALIGNMENT = "origin-yaw"
-"""Tracks start together and in one direction, so that what is seen (and what sigma speaks of) is the drift
-since then."""
 
 FAR_M = 1e4
 """Positions farther from zero than this are logged relative to a local origin: Rerun's 3D is float32."""

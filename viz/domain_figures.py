@@ -22,7 +22,7 @@ from . import indoor_figures, joint_figures, plan_figures, style
 from .canvas import PLACES
 from .curve import Curve
 from .floor import Anchor, plan_of
-from .panels import TIME, dress, nothing, run_color, seconds
+from .panels import MOST_ELLIPSES, TIME, dress, nothing, run_color, seconds
 from .phone_figures import detector, street_map, transform
 from .shapes import ELLIPSE95, circle, geo_circle, metres_a_degree
 from .stance_figures import conditions
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 JOINT, NAMED = "sensor_msgs/msg/JointState", "marcha_msgs/msg/NamedValues"
-MOST_ELLIPSES = 25
 
 
 def _topics(rec: Recording, needs: Sequence[str], *schemas: str, role: str = "") -> list[str]:

@@ -25,7 +25,7 @@ from . import style
 from .panels import GRID, TIME
 from .text import printable
 from .thinned import acc_norm, pieces, thinned
-from .trace import Trace, compared, distance, framed
+from .trace import ALIGNMENT, Trace, compared, distance, framed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-ALIGNMENT = "origin-yaw"
 WALK = "walk"
 """The figure of tracks, heights, stances and errors."""
 

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 GRID = {"color": "#DDDDDD", "linewidth": 0.6}
 TIME = "time since the start (s)"
+MOST_ELLIPSES = 25
+"""Along a track: more hide it."""
 BEST: Mapping[str, Any] = {"loc": "best"}
 """A legend where it hides least."""
 

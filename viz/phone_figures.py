@@ -16,7 +16,7 @@ from ..replay.metrics_place import stated_covariances
 from ..replay.source_stages import source_stages
 from . import style
 from .floor import loaders_of
-from .panels import TIME, dress, nothing, seconds
+from .panels import MOST_ELLIPSES, TIME, dress, nothing, seconds
 from .shapes import ELLIPSE95, geo_circle, metres_a_degree
 from .text import printable
 from .thinned import first_rows
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 SHOWN_S = 14.0
 """Time that the detector's panels show: about 25 steps, so that single peaks are seen."""
-MOST_ELLIPSES = 25
 PEAK, VALLEY, LIMIT = "#D55E00", "#0072B2", "#009E73"
 CORNER = {"loc": "upper right", "ncols": 2}
 

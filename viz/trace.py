@@ -15,6 +15,10 @@ from ..replay.view import Comparison, RunView, compare
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
+ALIGNMENT = "origin-yaw"
+"""Tracks start together and in one direction, so that what is seen (and what sigma speaks of) is the drift
+since then."""
+
 LIMIT = 65536
 """Points kept of a track; beyond it every second one goes, so memory stays bounded at any length."""
 

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...recording.errors import UsageError
+from ..checks import STANDARD_GRAVITY
 from .legmotion import PERSON, SIDES, Body, Chain, FloatArray, MotionTask, Pose, derivatives
-from .sensors import IDEAL, STANDARD_GRAVITY, ImuErrors, SimulatedImu
+from .sensors import IDEAL, ImuErrors, SimulatedImu
 from .tissue import SoftTissue, tissue
 from .walks import checked, plain
 

@@ -7,12 +7,12 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
+from ..checks import STANDARD_GRAVITY
 from .gait import FloatArray
 
 Vector = tuple[float, float, float]
 _NonNegative = Annotated[float, msgspec.Meta(ge=0)]
 
-STANDARD_GRAVITY = 9.80665
 """What one g of a full scale means (m/s²)."""
 
 

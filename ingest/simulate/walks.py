@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ...recording.errors import UsageError
 from ...recording.options import options_of
+from ..checks import STANDARD_GRAVITY
 from .gait import (
     FloatArray,
     GaitModel,
@@ -26,7 +27,6 @@ from .sensors import (
     IDEAL,
     MPU6050_1,
     MPU6050_2,
-    STANDARD_GRAVITY,
     UNKIND,
     ImuErrors,
     SimulatedImu,
