@@ -11,10 +11,11 @@ import polars as pl
 
 from ..recording import Recording
 from ..recording.errors import UsageError
+from ..recording.rotations import QUAT
 from ..recording.selection import Selection, selected_topics
 from .facts import origin, pretty
 from .files import write_files
-from .series import QUATERNION, Together, rate_hz, together
+from .series import Together, rate_hz, together
 
 JOINTS = "sensor_msgs/msg/JointState"
 MARKERS = "marcha_msgs/msg/OpticalMarkers"
@@ -123,7 +124,7 @@ class StoExporter(OpensimExporter):
 
     def fits(self, rec: Recording, topic: str) -> bool:
         """Return whether the channel has quaternions."""
-        return set(QUATERNION) <= set(rec.channels[topic].columns)
+        return set(QUAT) <= set(rec.channels[topic].columns)
 
     def text(self, data: Together, options: OpensimOptions) -> str:
         """Return the file; real part first, with every digit."""
@@ -134,7 +135,7 @@ class StoExporter(OpensimExporter):
         ]
         columns = []
         for topic in names:
-            q = np.column_stack([data.columns[topic][n] for n in QUATERNION])
+            q = np.column_stack([data.columns[topic][n] for n in QUAT])
             columns.append((_y_up(q) if options.y_up else q).tolist())
         for k, t in enumerate(data.t_ns.tolist()):
             cells = [",".join(map(repr, column[k])) for column in columns]

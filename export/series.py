@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from ..recording import Recording
 from ..recording.errors import UsageError
+from ..recording.rotations import QUAT
 from ..recording.selection import Selection
 
 Times = NDArray[np.int64]
 Floats = NDArray[np.float64]
-QUATERNION = ("quat_w", "quat_x", "quat_y", "quat_z")
 
 
 class Together(NamedTuple):
@@ -108,9 +108,9 @@ def _sorted(table: pl.DataFrame) -> pl.DataFrame:
 def _resampled(own: Times, numbers: dict[str, Floats], t_ns: Times) -> dict[str, Floats]:
     zero = own[0]
     x, x_new = (own - zero).astype(float), (t_ns - zero).astype(float)
-    out = {n: np.interp(x_new, x, v) for n, v in numbers.items() if n not in QUATERNION}
-    if all(n in numbers for n in QUATERNION):
-        out |= _slerp(x, np.column_stack([numbers[n] for n in QUATERNION]), x_new)
+    out = {n: np.interp(x_new, x, v) for n, v in numbers.items() if n not in QUAT}
+    if all(n in numbers for n in QUAT):
+        out |= _slerp(x, np.column_stack([numbers[n] for n in QUAT]), x_new)
     far = _far(own, t_ns)
     for values in out.values():
         values[far] = np.nan
@@ -120,7 +120,7 @@ def _resampled(own: Times, numbers: dict[str, Floats], t_ns: Times) -> dict[str,
 def _slerp(x: Floats, q: Floats, x_new: Floats) -> dict[str, Floats]:
     """Return quaternions at other times (Shoemake 1985)."""
     if len(x) < 2:
-        return {n: np.full(len(x_new), q[0, i]) for i, n in enumerate(QUATERNION)}
+        return {n: np.full(len(x_new), q[0, i]) for i, n in enumerate(QUAT)}
     k = np.clip(np.searchsorted(x, x_new, side="right") - 1, 0, len(x) - 2)
     share = (x_new - x[k]) / (x[k + 1] - x[k])
     a, b = q[k], q[k + 1]
@@ -133,7 +133,7 @@ def _slerp(x: Floats, q: Floats, x_new: Floats) -> dict[str, Floats]:
     wb = np.where(small, share, np.sin(share * angle) / sine)
     mixed = wa[:, None] * a + wb[:, None] * b
     mixed /= np.linalg.norm(mixed, axis=1, keepdims=True)
-    return {n: mixed[:, i] for i, n in enumerate(QUATERNION)}
+    return {n: mixed[:, i] for i, n in enumerate(QUAT)}
 
 
 def rate_hz(t_ns: Times) -> float:

@@ -13,6 +13,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ..recording.errors import MarchaError, UsageError
+from ..recording.rotations import QUAT
 from .contract import ReportBuilder
 
 FloatArray = NDArray[np.float64]
@@ -22,7 +23,6 @@ MAG = "sensor_msgs/msg/MagneticField"
 ORIENTATION = "geometry_msgs/msg/QuaternionStamped"
 JOINTS = "sensor_msgs/msg/JointState"
 MARKERS = "marcha_msgs/msg/OpticalMarkers"
-QUAT = ("quat_w", "quat_x", "quat_y", "quat_z")
 
 MARKERS_TOPIC = "/reference/markers"
 JOINT_TOPIC = "/reference/joint"

@@ -17,6 +17,7 @@ import numpy as np
 import polars as pl
 
 from ..recording.errors import MarchaError
+from ..recording.rotations import QUAT
 from .checks import SensorCheck, check_plausible
 from .contract import ChannelSpec, ReportBuilder, SourceAttachment
 from .fixes import finished_fixes, velocities, velocity_spec
@@ -32,7 +33,6 @@ VALUES = "marcha_msgs/msg/NamedValues"
 RADIO = "marcha_msgs/msg/RadioSignal"
 POINT = "geometry_msgs/msg/PointStamped"
 STEP = "marcha_msgs/msg/Step"
-QUAT = ("quat_w", "quat_x", "quat_y", "quat_z")
 
 AXES = (
     "Android: x right, y to the top of the phone, z out of the screen; accelerometer with gravity, +1 g on z "

@@ -11,6 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+QUAT = ("quat_w", "quat_x", "quat_y", "quat_z")
+"""Columns of a rotation, in the order of tables."""
+
 
 def xyzw_from_wxyz(quat: ArrayLike) -> NDArray[Any]:
     """Return quaternions ``(…, 4)`` with the real part last, given it first."""

@@ -11,10 +11,10 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ..algorithms.contract import FloatArray
+from ..recording.rotations import QUAT
 from .alignment import IntArray, yaw_of
 
 POSITION = ("pos_x", "pos_y", "pos_z")
-QUATERNION = ("quat_w", "quat_x", "quat_y", "quat_z")
 REST_NS = 500_000_000
 """How long beyond what was recorded a walker is taken to stay where he was."""
 
@@ -87,7 +87,7 @@ def track_of(table: pl.DataFrame | None) -> Trajectory | None:
         table = table.sort("t_ns", maintain_order=True).unique("t_ns", keep="first", maintain_order=True)
     if table.is_empty():
         return None
-    quat = table.select(QUATERNION).to_numpy() if set(QUATERNION) <= set(table.columns) else None
+    quat = table.select(QUAT).to_numpy() if set(QUAT) <= set(table.columns) else None
     if quat is not None and not np.isfinite(quat).all():
         quat = None
     return Trajectory(table["t_ns"].to_numpy(), table.select(POSITION).to_numpy(order="c"), quat)
@@ -98,13 +98,13 @@ def track_of_stream(rows: int, tables: Iterator[pl.DataFrame], headings: bool) -
 
     None also where the pieces are not in order.
     """
-    names = (*POSITION, *QUATERNION) if headings else POSITION
+    names = (*POSITION, *QUAT) if headings else POSITION
     t_ns, values = np.empty(rows, np.int64), np.empty((rows, len(names)))
     n = 0
     for table in tables:
         if not set(POSITION) <= set(table.columns):
             return None
-        if headings and not set(QUATERNION) <= set(table.columns):
+        if headings and not set(QUAT) <= set(table.columns):
             names, values, headings = POSITION, np.ascontiguousarray(values[:, :3]), False
         columns = [table[name].to_numpy() for name in names]
         good = np.logical_and.reduce([np.isfinite(c) for c in columns[:3]])

@@ -17,11 +17,11 @@ import numpy as np
 import polars as pl
 
 from ..algorithms.contract import FloatArray
+from ..recording.rotations import QUAT
 from .alignment import IntArray, Matches, Transform, align, match, wrap
 from .references import own_record, reference_of, references
 from .trajectory import (
     POSITION,
-    QUATERNION,
     OutOfOrderError,
     Trajectory,
     Way,
@@ -276,7 +276,7 @@ class RunView:
     @cached_property
     def track(self) -> Trajectory | None:
         """The estimated track: of the output ``pose``, else of ``position``."""
-        headings = QUATERNION if self.reference is not None else ()
+        headings = QUAT if self.reference is not None else ()
         if self.whole is not None and self.whole.stream is not None and self.spans is not None:
             whole = self.whole.track
             return None if whole is None else whole.within(self.spans)

@@ -8,8 +8,9 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from ..recording.rotations import QUAT
 from ..replay.alignment import Transform
-from ..replay.trajectory import POSITION, QUATERNION
+from ..replay.trajectory import POSITION
 from ..replay.view import Comparison, RunView, compare
 
 Floats = NDArray[np.float64]
@@ -125,7 +126,7 @@ class Trace:
         columns: dict[str, NDArray] = {"t_ns": self.t_ns}
         columns |= dict(zip(POSITION, self.positions.T, strict=True))
         if np.isfinite(self.quat_wxyz).all():
-            columns |= dict(zip(QUATERNION, self.quat_wxyz.T, strict=True))
+            columns |= dict(zip(QUAT, self.quat_wxyz.T, strict=True))
         return pl.DataFrame(columns)
 
 

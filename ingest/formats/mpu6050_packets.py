@@ -18,6 +18,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ...recording.errors import MarchaError
+from ...recording.rotations import QUAT
 from ..checks import SensorCheck
 from ..contract import (
     HEAD_BYTES,
@@ -34,7 +35,6 @@ from .mpu6050 import (
     scales,
 )
 
-QUATERNION = ("quat_w", "quat_x", "quat_y", "quat_z")
 RAW = ("q0", "q1", "q2", "q3", "ax", "ay", "az", "gx", "gy", "gz")
 #: One unit of the quaternion (Q14, MPU-6050 DMP).
 Q14 = 1 / 16384
@@ -86,8 +86,7 @@ class Mpu6050Packets:
             }
         }
         channels = [
-            ChannelSpec(f"/foot/imu{n}", IMU, f"imu{n}", (*AXES, *QUATERNION), scale[n].metadata())
-            for n in numbers
+            ChannelSpec(f"/foot/imu{n}", IMU, f"imu{n}", (*AXES, *QUAT), scale[n].metadata()) for n in numbers
         ]
         return Import(
             channels=channels,
@@ -238,4 +237,4 @@ class _Sensor:
             )
             quat[wrong] = np.nan
         quat[~wrong] /= norm[~wrong, None]
-        return dict(zip(QUATERNION, quat.T, strict=True))
+        return dict(zip(QUAT, quat.T, strict=True))

@@ -26,6 +26,7 @@ import polars as pl
 
 from ...recording.errors import MarchaError, UsageError
 from ...recording.provenance import hash_file
+from ...recording.rotations import QUAT
 from ..columns import (
     Header,
     find_header,
@@ -66,7 +67,6 @@ REFERENCE = ChannelSpec(
     "floor",
     metadata={"frame": "surveyed floor: x, y measured, z = 0 by definition (flat floor), no orientation"},
 )
-QUAT = ("quat_w", "quat_x", "quat_y", "quat_z")
 
 _FIELDS = {
     "estCompensatedAccel": ("acc", "m/s2"),
