@@ -78,7 +78,7 @@ def read_blocks(path: Path, size: int | None = BLOCK_BYTES) -> Iterator[tuple[by
         with path.open("rb") as f:
             rest: list[bytes] = []
             while data := f.read(-1 if size is None else size):
-                if size is not None and len(data) < size:  # its end: a last line without an end is no piece
+                if size is not None and len(data) < size:  # the file's end, which need not be a line's
                     yield b"".join((*rest, data)), True
                     return
                 cut = 0 if size is None else data.rfind(b"\n") + 1
