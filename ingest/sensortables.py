@@ -18,11 +18,10 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from ..recording.codec import MAX_TIME_NS
 from ..recording.errors import MarchaError
 from ..recording.files import read_small
 from .cells import NoRowError
-from .columns import float_blocks, require_header
+from .columns import careful_block, float_blocks, require_header
 from .contract import ReportBuilder
 from .text import start_of
 
@@ -145,8 +144,12 @@ def _annotations(file: Path, report: ReportBuilder) -> SensorTable | None:
         raise MarchaError(f"{file}, line {reader.line_num}: {error}; repair the line") from None
     if not rows:
         return None
-    frame = _numbers(pl.DataFrame({n: [row[k] for row in rows] for k, n in enumerate(header.names) if n}))
-    return _held(ANNOTATION, frame.with_columns(line=pl.Series(lines)))
+    kinds = {n: pl.Int64 if n == "time" else pl.String for n in header.names if n}
+    cells = {n: [row[k] for row in rows] for k, n in enumerate(header.names) if n}
+    frame = careful_block(
+        pl.DataFrame({"line": lines, **cells}), {n: n for n in kinds}, kinds, "time", report
+    )
+    return _held(frame.rename({"time": "t"}))
 
 
 def _csv(file: Path, report: ReportBuilder) -> SensorTable | None:
@@ -190,7 +193,7 @@ def _json(path: Path) -> tuple[Tables, dict[str, str]]:
         by_sensor.setdefault(str(row.get("sensor", "")), []).append(row)
     about = {k: str(v) for k, v in (by_sensor.get("Metadata") or [{}])[0].items()}
     tables = {k: pl.DataFrame(v, infer_schema_length=None) for k, v in by_sensor.items() if k in READ}
-    return {k: _held(k, _numbers(v)) for k, v in tables.items() if "time" in v.columns}, about
+    return {k: _held(_numbers(v)) for k, v in tables.items() if "time" in v.columns}, about
 
 
 def _sqlite(path: Path) -> tuple[Tables, dict[str, str]]:
@@ -210,26 +213,18 @@ def _sqlite(path: Path) -> tuple[Tables, dict[str, str]]:
                 elif rows and "time" in columns:
                     data = dict(zip(columns, map(list, zip(*rows, strict=True)), strict=True))
                     texts = pl.DataFrame(data, schema=dict.fromkeys(columns, pl.String))
-                    tables[name] = _held(name, _numbers(texts))
+                    tables[name] = _held(_numbers(texts))
     except sqlite3.Error as error:
         raise MarchaError(f"{path}: the database cannot be read: {error}") from None
     return tables, about
 
 
-def _held(name: str, frame: pl.DataFrame) -> SensorTable:
-    """Return a table that is in memory; rows whose time no recording can have are none."""
-    possible = frame["t"].is_between(0, MAX_TIME_NS).fill_null(value=False)
-    rows = frame.filter(possible)
+def _held(frame: pl.DataFrame) -> SensorTable:
+    rows = frame.drop_nulls("t")
 
     def frames(report: ReportBuilder) -> Iterator[pl.DataFrame]:
-        if rows.height < frame.height:
-            report.drop(
-                "bad_row",
-                f"{name}: time is no whole number of nanoseconds from 1970 to 2038; row dropped",
-                count=frame.height - rows.height,
-                line=frame.filter(~possible)["line"][0],
-                subject=f"{name} time",
-            )
+        if timeless := frame.height - rows.height:
+            report.drop("bad_row", "time: not a number; row dropped", count=timeless, subject="time")
         yield rows
 
     return SensorTable(rows, frames, whole=True)

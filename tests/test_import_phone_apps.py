@@ -208,8 +208,9 @@ def test_sensor_logger_takes_what_the_user_wrote(tmp_path: Path, walk: PhoneWalk
     done = convert(folder, tmp_path / "a.mcap")
     findings = {(f.kind, f.count, f.first_line, f.detail.split(":")[0]) for f in done.report.findings}
     assert findings >= {
+        ("bad_row", 1, 5, "time"),
         ("bad_row", 1, 6, "Annotation.csv"),
-        ("bad_row", 2, 5, "Annotation"),
+        ("bad_row", 1, 7, "Annotation"),
         ("unused_file", 1, None, "Light.csv"),
     }
     marks = mr.open(tmp_path / "a.mcap").annotations

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 import polars as pl
 
+from ...recording.codec import MAX_TIME_NS
 from ..checks import STANDARD_GRAVITY
 from ..columns import find_header
 from ..contract import CommonOptions, Import, ReportBuilder, SourceAttachment
@@ -146,6 +147,16 @@ def _annotations(table: SensorTable, report: ReportBuilder) -> pl.DataFrame:
     How long the button was pressed is not how long the text holds: it stays a fact beside it.
     """
     rows = pl.concat(table.frames(report))
+    possible = rows["t"].is_between(0, MAX_TIME_NS)
+    if not possible.all():
+        report.drop(
+            "bad_row",
+            f"{ANNOTATION}: time is not between 1970 and 2038; row dropped",
+            count=int((~possible).sum()),
+            line=rows.filter(~possible)["line"][0],
+            subject=ANNOTATION,
+        )
+        rows = rows.filter(possible)
     report.keep(rows.height)
     return rows.select(
         tier=pl.lit("events"),
