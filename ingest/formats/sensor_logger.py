@@ -59,10 +59,10 @@ if TYPE_CHECKING:
 
 _XYZ = ("x", "y", "z")
 _Q = ("qw", "qx", "qy", "qz")
-_AGREES, _CLEARER = np.radians(20.0), np.radians(60.0)
+_AGREES_RAD, _CLEARER_RAD = np.radians(20.0), np.radians(60.0)
 """An orientation is believed whose vertical lies as near to the measured force, in the median; and the other
 platform's north where it is so much nearer to the field, which iron in the phone turns."""
-_NEAR_DIP = np.radians(30.0)
+_NEAR_DIP_RAD = np.radians(30.0)
 """So near must the measured dip of the field be to the one that the place has, and so far that of the other sign."""
 
 
@@ -212,9 +212,9 @@ def _turned_by_field(tables: Tables) -> bool | None:
     if not good.any():
         return None
     dip = math.asin(float(np.median((up * field).sum(axis=1)[good] / size[good])))
-    if abs(dip - expected) < _NEAR_DIP < abs(dip + expected):
+    if abs(dip - expected) < _NEAR_DIP_RAD < abs(dip + expected):
         return False
-    return True if abs(dip + expected) < _NEAR_DIP < abs(dip - expected) else None
+    return True if abs(dip + expected) < _NEAR_DIP_RAD < abs(dip - expected) else None
 
 
 def _streams(
@@ -352,7 +352,7 @@ def _orientation(tables: Tables, acc: SensorTable | None, platform: str) -> tupl
         if field is not None:
             east, ahead = rot.apply(field)[:, :2].mean(axis=0)
             aside = abs(math.atan2(east, ahead))
-        if tilt <= _AGREES and (best is None or aside < best[0] - _CLEARER):
+        if tilt <= _AGREES_RAD and (best is None or aside < best[0] - _CLEARER_RAD):
             best = aside, turn
     return True, None if best is None else best[1]
 
