@@ -22,21 +22,20 @@ dorsiflexion are negative (ISB: positive); abduction and external rotation are p
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from .jointangles import FUNCTIONAL, AxisTurn, FloatArray, cardan, planar
 
 SIDES = ("left", "right")
 JOINTS = {"hip": ("trunk", "thigh"), "knee": ("thigh", "shank"), "ankle": ("shank", "foot")}
 """Joints: upper and lower segment."""
 FARTHEST_M = 1e6
 """A marker farther than this from the origin of its room is none."""
-STATIC_S = 1.0
-"""Stretch at the start whose mean pose is zero where nothing else says it."""
 RIGID_M = 0.02
 """Root mean square misfit of a cluster above which it is not called rigid."""
 
@@ -178,7 +177,9 @@ def anatomy(names: Sequence[str], roles: Mapping[str, str] | None = None) -> Ana
     return Anatomy(landmarks, {key: own for key, own in clusters.items() if len(own) >= 3})
 
 
-def cluster_attitude(pos: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+def cluster_attitude(
+    pos: FloatArray, shape: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray, FloatArray, float]:
     """Return attitude and middle of a rigid cluster, its shape, and the misfit (Kabsch 1976).
 
     Parameters
@@ -186,6 +187,8 @@ def cluster_attitude(pos: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
     pos : ndarray, shape (n, markers, 3)
         NaN where a marker is hidden; one farther than :data:`FARTHEST_M` is taken for hidden. Frames with fewer
         than three seen have no attitude.
+    shape : ndarray, shape (markers, 3), optional
+        Of the cluster, where it is known; else it is the mean of the frames in which all markers are seen.
 
     Returns
     -------
@@ -197,38 +200,42 @@ def cluster_attitude(pos: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
     n, m = pos.shape[:2]
     lost = np.full((n, 3, 3), np.nan), np.full((n, 3), np.nan), np.full((m, 3), np.nan), float("nan")
     whole = np.flatnonzero(seen.all(axis=1))
-    if not whole.size:
-        return lost
-    shape = pos[whole[0]] - pos[whole[0]].mean(axis=0)
-    if np.linalg.svd(shape, compute_uv=False)[1] < 0.005:
-        return lost  # the markers lie on a line
     good = np.flatnonzero(seen.sum(axis=1) >= 3)
+    if shape is None and not whole.size:
+        return lost
+    form = pos[whole[0]] - pos[whole[0]].mean(axis=0) if shape is None else shape
+    if not good.size or np.linalg.svd(form, compute_uv=False)[1] < 0.005:
+        return lost  # the markers lie on a line
     rot, place = lost[0], lost[1]
     filled, weight = np.where(seen[..., None], pos, 0.0)[good], seen[good].astype(float)
     count = weight.sum(axis=1)[:, None]
-    for again in range(2):
+    for final in (False, True) if shape is None else (True,):
         middle = np.einsum("nmi,nm->ni", filled, weight) / count
-        own = weight @ shape / count
+        own = weight @ form / count
         spread = np.einsum(
-            "nmi,nmj,nm->nij", filled - middle[:, None], shape[None] - own[:, None], weight, optimize=True
+            "nmi,nmj,nm->nij", filled - middle[:, None], form[None] - own[:, None], weight, optimize=True
         )
         u, _, vt = np.linalg.svd(spread)
         u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
         turned = u @ vt
         rot[good], place[good] = turned, middle - np.einsum("nij,nj->ni", turned, own)
-        if again == 0:  # the mean shape instead of that of one frame
-            shape = np.einsum("nji,nmj->mi", rot[whole], pos[whole] - place[whole][:, None]) / len(whole)
-    error = filled - (place[good][:, None] + np.einsum("nij,mj->nmi", rot[good], shape))
+        if not final:  # the mean shape instead of that of one frame
+            form = np.einsum("nji,nmj->mi", rot[whole], pos[whole] - place[whole][:, None]) / len(whole)
+    error = filled - (place[good][:, None] + np.einsum("nij,mj->nmi", rot[good], form))
     misfit = float(np.sqrt(np.sum(weight * np.sum(error**2, axis=2)) / weight.sum()))
-    return rot, place, shape, misfit
+    return rot, place, form, misfit
 
 
-def carried(point: FloatArray, rot: FloatArray, place: FloatArray) -> FloatArray:
-    """Return a landmark (n, 3), where it is hidden as its cluster carries it (CAST)."""
+def place_in_cluster(point: FloatArray, rot: FloatArray, place: FloatArray) -> FloatArray | None:
+    """Return where a landmark (n, 3) is in its cluster (3,); None if both are hardly ever seen together."""
     both = np.isfinite(point).all(axis=1) & np.isfinite(place).all(axis=1)
     if both.sum() < 10:
-        return point
-    own = np.median(np.einsum("nji,nj->ni", rot[both], point[both] - place[both]), axis=0)
+        return None
+    return np.median(np.einsum("nji,nj->ni", rot[both], point[both] - place[both]), axis=0)
+
+
+def carried(point: FloatArray, rot: FloatArray, place: FloatArray, own: FloatArray) -> FloatArray:
+    """Return a landmark (n, 3), where it is hidden as its cluster, in which it is at ``own``, carries it (CAST)."""
     hidden = ~np.isfinite(point).all(axis=1)
     out = point.copy()
     out[hidden] = (place + rot @ own)[hidden]
@@ -250,70 +257,13 @@ def frame(z: FloatArray, x: FloatArray, *, along_x: bool = False) -> FloatArray:
     return np.stack([np.cross(y, z), y, z], axis=2)
 
 
-def cardan(upper: FloatArray, lower: FloatArray) -> FloatArray:
-    """Return flexion, abduction, rotation (n, 3), rad, of M = upperᵀ lower = Rx(−f) Ry(−a) Rz(−r)."""
-    m = np.swapaxes(upper, -1, -2) @ lower
-    return np.stack(
-        [
-            np.arctan2(m[..., 1, 2], m[..., 2, 2]),
-            -np.arcsin(np.clip(m[..., 0, 2], -1.0, 1.0)),
-            np.arctan2(m[..., 0, 1], m[..., 0, 0]),
-        ],
-        axis=-1,
-    )
-
-
-def twist(upper: FloatArray, lower: FloatArray, axis: FloatArray) -> FloatArray:
-    """Return the turn of the upper frame against the lower one about ``axis`` (n,), rad, without jumps."""
-    from scipy.spatial.transform import Rotation
-
-    m = np.swapaxes(lower, -1, -2) @ upper
-    out = np.full(len(m), np.nan)
-    good = np.isfinite(m).all(axis=(1, 2))
-    if good.any():
-        quat = Rotation.from_matrix(m[good]).as_quat()
-        out[good] = np.unwrap(2.0 * np.arctan2(quat[:, :3] @ axis, quat[:, 3]))
-        out[good] -= 2 * np.pi * np.round(np.median(out[good]) / (2 * np.pi))
-    return out
-
-
-def planar(long_upper: FloatArray, long_lower: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the angle from the lower long axis to the upper one in the plane across ``right`` (n,), rad."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        right = right / np.linalg.norm(right, axis=1, keepdims=True)
-    u, v = (a - np.sum(a * right, axis=1, keepdims=True) * right for a in (long_upper, long_lower))
-    return np.arctan2(np.sum(right * np.cross(v, u), axis=1), np.sum(u * v, axis=1))
-
-
-def functional(t: FloatArray, upper: FloatArray, lower: FloatArray, flexes: float) -> FloatArray | None:
-    """Return the turn about the main axis of the relative turn (n,), zero in the first second; None without motion.
-
-    ``flexes`` is the sign of the direction in which the joint turns farther.
-    """
-    from scipy.spatial.transform import Rotation
-
-    m = np.swapaxes(lower, -1, -2) @ upper
-    good = np.flatnonzero(np.isfinite(m).all(axis=(1, 2)))
-    if good.size < 30:
-        return None
-    turned = Rotation.from_matrix(m[good])
-    start = turned[: int(np.searchsorted(t[good], t[good[0]] + STATIC_S, side="right"))].mean()
-    step = (turned[:-1].inv() * turned[1:]).as_rotvec()
-    power, directions = np.linalg.eigh(step.T @ step)
-    if power[2] < 1e-9:
-        return None
-    axis = start.apply(directions[:, 2])  # of the upper frame, seen from the lower one at the start
-    quat = (turned * start.inv()).as_quat()
-    angle = np.unwrap(2.0 * np.arctan2(quat[:, :3] @ axis, quat[:, 3]))
-    angle -= 2 * np.pi * np.round(angle[0] / (2 * np.pi))
-    low, high = np.percentile(angle, (2, 98))
-    out = np.full(len(m), np.nan)
-    out[good] = angle * (flexes if high >= -low else -flexes)
-    return out
-
-
 def from_markers(
-    t: FloatArray, names: Sequence[str], pos: FloatArray, definition: str, roles: Mapping[str, str]
+    t: FloatArray,
+    names: Sequence[str],
+    pos: FloatArray,
+    definition: str,
+    roles: Mapping[str, str],
+    constants: dict[Any, Any] | None = None,
 ) -> ReferenceAngles:
     """Return the reference angles that a capture's markers say.
 
@@ -327,6 +277,8 @@ def from_markers(
         See the module.
     roles : mapping
         Marker to landmark, as the user says.
+    constants : dict, optional
+        What does not change in a capture: filled by its first frames, used for the others, which come in windows.
 
     Raises
     ------
@@ -336,26 +288,36 @@ def from_markers(
     body = anatomy(names, roles)
     legs = body.legs
     angles = ReferenceAngles()
-    trunk = _Side(names, pos, body, "")
+    constants = {} if constants is None else constants
+    trunk = _Side(names, pos, body, "", constants)
     if (rot := trunk.trunk_frame()) is not None:
         angles.rot["trunk"] = rot
     for side in legs:
         prefix = f"{side}_" if side and len(legs) > 1 else ""
-        _leg(t, _Side(names, pos, body, side), prefix, definition, angles)
+        _leg(t, _Side(names, pos, body, side, constants), prefix, definition, angles)
     return angles
 
 
 class _Side:
     """Markers of one leg, with what its clusters carry."""
 
-    def __init__(self, names: Sequence[str], pos: FloatArray, body: Anatomy, side: str) -> None:
-        self.pos, self.body, self.side = pos, body, side
+    def __init__(
+        self, names: Sequence[str], pos: FloatArray, body: Anatomy, side: str, constants: dict[Any, Any]
+    ) -> None:
+        self.pos, self.body, self.side, self._constants = pos, body, side, constants
         self.attitude: dict[str, tuple[FloatArray, FloatArray]] = {}
         self.doubts: list[str] = []
         for (own, segment), places in body.clusters.items():
             if own != side and segment != "trunk":
                 continue
-            rot, place, _, misfit = cluster_attitude(pos[:, places])
+            key = side, "cluster", own, segment
+            if key in constants:
+                if constants[key] is not None:
+                    rot, place, *_ = cluster_attitude(pos[:, places], constants[key])
+                    self.attitude[segment] = rot, place
+                continue
+            rot, place, shape, misfit = cluster_attitude(pos[:, places])
+            constants[key] = shape if misfit <= RIGID_M else None
             if misfit > RIGID_M:
                 self.doubts.append(
                     f"{', '.join(names[k] for k in places)}: no rigid cluster ({1000 * misfit:.0f} mm rms, at most "
@@ -364,14 +326,22 @@ class _Side:
             elif np.isfinite(misfit):
                 self.attitude[segment] = rot, place
 
+    def once(self, key: str, value: Callable[[], Any]) -> Any:
+        """Return what is constant of this leg: the value that the capture's first frames gave."""
+        if (self.side, key) not in self._constants:
+            self._constants[self.side, key] = value()
+        return self._constants[self.side, key]
+
     def mark(self, role: str, segment: str, side: str | None = None) -> FloatArray | None:
         """Return a landmark (n, 3), carried by the segment's cluster where it is hidden."""
         k = self.body.landmarks.get((self.side if side is None else side, role))
         if k is None:
             return None
-        return (
-            carried(self.pos[:, k], *self.attitude[segment]) if segment in self.attitude else self.pos[:, k]
-        )
+        point = self.pos[:, k]
+        if segment not in self.attitude:
+            return point
+        own = self.once(f"marker {k} in {segment}", lambda: place_in_cluster(point, *self.attitude[segment]))
+        return point if own is None else carried(point, *self.attitude[segment], own)
 
     def centre(self, joint: str, segment: str) -> FloatArray | None:
         """Return the middle of a joint: between its landmarks, else the one that there is."""
@@ -411,14 +381,15 @@ def _leg(t: FloatArray, leg: _Side, prefix: str, definition: str, result: Refere
     hip = hip if hip is not None else leg.mark("trochanter", "thigh")
     knee, ankle = leg.centre("knee", "thigh"), leg.centre("ankle", "shank")
     bend = (
-        bent_about(hip - knee, knee - ankle)
+        leg.once("bend", lambda: bent_about(hip - knee, knee - ankle))
         if hip is not None and knee is not None and ankle is not None
         else None
     )
     right: dict[str, FloatArray] = {}
     for joint, segment in (("knee", "thigh"), ("ankle", "shank")):
         if (line := leg.outwards(joint, segment)) is not None:
-            right[segment] = line * _to_the_right(leg, line, bend, result)
+            sign = leg.once(f"right of the {joint}", partial(_to_the_right, leg, line, bend, result))
+            right[segment] = line * sign
     if hip is not None and knee is not None and "thigh" in right:
         result.rot[f"{prefix}thigh"] = frame(hip - knee, right["thigh"])
     lower = right.get("shank", right.get("thigh"))
@@ -454,16 +425,11 @@ def _leg(t: FloatArray, leg: _Side, prefix: str, definition: str, result: Refere
                 )
         elif joint != "ankle" and up in leg.attitude and low in leg.attitude:
             flexes = -1.0 if joint == "hip" else 1.0
-            angle = functional(t, leg.attitude[up][0], leg.attitude[low][0], flexes)
+            turn = leg.once(f"turn of the {joint}", partial(AxisTurn, None, flexes))
+            angle = turn.angle(t, leg.attitude[up][0], leg.attitude[low][0])
             if angle is not None:
                 result.angle[name] = angle
                 result.remarks[name] = FUNCTIONAL
-
-
-FUNCTIONAL = (
-    "functional: turn about the main axis of the relative turn, zero in the first second; where it turns farther is "
-    "flexion"
-)
 
 
 def bent_about(thigh: FloatArray, shank: FloatArray) -> FloatArray | None:

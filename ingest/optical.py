@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -23,6 +23,8 @@ TimedTables = tuple[NDArray[np.int64], NDArray[np.int64], Sequence[tuple[str, pl
 """Rows of one clock: time (ns) and line of each, and topics with their columns, as many rows."""
 ROWS = 8192
 """Rows of a block."""
+HEAD_ROWS = 32_768
+"""First frames of a capture, which say what is constant in it: shapes of clusters, sides, axes, where zero is."""
 ANGLES_TOPIC = "/reference/optical/joint"
 """Angles made of markers; what a file itself says of angles is ``/reference/joint``."""
 
@@ -45,24 +47,6 @@ def read_text(path: Path) -> str:
         .replace("\r\n", "\n")
         .replace("\r", "\n")
     )
-
-
-def float_rows(
-    path: Path,
-    lines: Sequence[str],
-    first_line: int,
-    separator: str,
-    names: Sequence[str],
-    report: ReportBuilder,
-) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Return all rows of numbers (n, columns) and their lines, as :func:`float_windows` reads them.
-
-    Raises
-    ------
-    MarchaError
-        No row is left.
-    """
-    return next(float_windows(path, [(first_line, lines)], separator, names, report))
 
 
 def float_windows(
@@ -187,44 +171,34 @@ def blocks_of(windows: Iterable[TimedTables], report: ReportBuilder) -> Iterator
             yield topic, block.select("t_ns", *(pl.col(f"{k} {c}").alias(c) for c in columns))
 
 
-def _of_rows(frames: Iterable[pl.DataFrame], rows: int) -> Iterator[pl.DataFrame]:
-    """Yield the rows of frames in frames of equal length: what is found does not depend on how they were read."""
-    rest: pl.DataFrame | None = None
+def _of_rows(frames: Iterable[pl.DataFrame], rows: int, first: int | None = None) -> Iterator[pl.DataFrame]:
+    """Yield the rows of frames in frames of ``rows``, the first of ``first``: they do not depend on how they came."""
+    size, rest = first or rows, None
     for frame in frames:
-        whole = frame if rest is None else pl.concat([rest, frame], rechunk=True)
-        end = whole.height // rows * rows
-        yield from (whole[i : i + rows] for i in range(0, end, rows))
-        rest = whole[end:]
-    if rest is not None:
-        yield rest
+        rest = frame if rest is None else pl.concat([rest, frame])
+        while rest.height >= size:
+            yield rest[:size].rechunk()
+            rest, size = rest[size:], rows
+    if rest is not None and rest.height:
+        yield rest.rechunk()
+
+
+def beside_each_other(left: Iterable[pl.DataFrame], right: Iterable[pl.DataFrame]) -> Iterator[pl.DataFrame]:
+    """Yield frames with the columns of both, which are as many rows in pieces of their own."""
+    for one, other in zip(_of_rows(left, ROWS), _of_rows(right, ROWS), strict=True):
+        yield one.hstack(other.drop("t", "line"))
+
+
+def marker_columns(names: Sequence[str]) -> list[str]:
+    """Return the columns of markers."""
+    return [f"{n}.{a}" for n in names for a in "xyz"]
 
 
 def marker_table(names: Sequence[str], pos: FloatArray) -> pl.DataFrame:
     """Return markers (n, m, 3) in metres as the columns of :data:`MARKERS`."""
     return pl.DataFrame(
-        {
-            f"{n}.{a}": np.ascontiguousarray(pos[:, k, j])
-            for k, n in enumerate(names)
-            for j, a in enumerate("xyz")
-        }
+        {c: np.ascontiguousarray(pos[:, k // 3, k % 3]) for k, c in enumerate(marker_columns(names))}
     )
-
-
-def note_hidden(names: Sequence[str], pos: FloatArray, report: ReportBuilder) -> None:
-    """Say how much of the markers was not seen.
-
-    Shape of ``pos``: (n, markers, 3).
-    """
-    hidden = np.isnan(pos).any(axis=2)
-    if hidden.any():
-        row, k = (int(i[0]) for i in np.nonzero(hidden))
-        report.note(
-            "missing_cell",
-            f"{MARKERS_TOPIC}: {100 * hidden.mean():.2g} % of the positions are missing (first {names[k]}): NaN",
-            count=int(hidden.sum()),
-            line=row + 1,
-            subject="hidden",
-        )
 
 
 class MarkerOptions(CommonOptions, frozen=True, kw_only=True):
@@ -264,76 +238,146 @@ class MarkerOptions(CommonOptions, frozen=True, kw_only=True):
 
 
 def marker_import(
-    t_ns: NDArray[np.int64],
-    lines: NDArray[np.int64],
+    frames: Iterable[pl.DataFrame],
     names: Sequence[str],
-    pos: FloatArray,
     report: ReportBuilder,
     device: dict[str, str],
     options: MarkerOptions,
-    more: Sequence[tuple[ChannelSpec, pl.DataFrame]] = (),
+    more: Sequence[ChannelSpec] = (),
 ) -> Import:
-    """Return the import of a capture of markers (m), of channels ``more`` at the same times, and of its angles.
+    """Return the import of a capture of markers, of channels ``more`` at the same times, and of its angles.
 
-    Shapes: ``t_ns`` and ``lines`` (n,), ``pos`` (n, markers, 3).
+    Parameters
+    ----------
+    frames : iterable of polars.DataFrame
+        ``t`` (ns), ``line``, ``<marker>.x`` … (m) as :func:`marker_columns` has them, and ``<topic> <column>`` of
+        ``more``; at least one.
+    names : sequence of str
+        Of the markers.
+    report : ReportBuilder
+        Takes what is found.
+    device : dict
+        Metadata of the device.
+    options : MarkerOptions
+        How angles are made.
+    more : sequence of ChannelSpec
+        Channels, their columns named.
     """
-    note_hidden(names, pos, report)
-    table = marker_table(names, pos)
-    spec = ChannelSpec(MARKERS_TOPIC, MARKERS, "optical", tuple(table.columns))
-    tables = [(spec, table), *more, *angle_channels(t_ns, names, pos, report, options)]
-    blocks = blocks_of([(t_ns, lines, [(s.topic, t) for s, t in tables])], report)
-    turning = [s.topic for s, _ in tables if s.schema == ORIENTATION]
+    windows = _of_rows(frames, ROWS, HEAD_ROWS)
+    reference = _Reference(names, options, report)
+    head = next(windows)
+    waiting = [(head, reference.of(head))]  # popped when it is read: closures hold what they name
+    own = ChannelSpec(MARKERS_TOPIC, MARKERS, "optical", tuple(marker_columns(names)))
+    specs = [own, *more, *(spec for spec, _ in waiting[0][1])]
+
+    def windowed() -> Iterator[tuple[pl.DataFrame, list[tuple[ChannelSpec, pl.DataFrame]]]]:
+        yield waiting.pop()
+        yield from ((frame, reference.of(frame)) for frame in windows)
+
+    def tables() -> Iterator[TimedTables]:
+        for frame, angles in windowed():
+            by_topic = {spec.topic: table for spec, table in angles}
+            by_topic[own.topic] = frame
+            by_topic |= {
+                s.topic: frame.select(pl.col(f"{s.topic} {c}").alias(c) for c in s.columns) for s in more
+            }
+            yield (
+                frame["t"].to_numpy(),
+                frame["line"].to_numpy(),
+                [(s.topic, by_topic[s.topic].select(s.columns)) for s in specs],
+            )
+        reference.finish()
+
+    turning = [s.topic for s in specs if s.schema == ORIENTATION]
     return Import(
-        channels=[s for s, _ in tables],
-        blocks=rotations(unseen(blocks, report), turning, report),
+        channels=specs,
+        blocks=rotations(unseen(blocks_of(tables(), report), report), turning, report),
         report=report,
         metadata={"device": {"clock": "device", "frames": "as the capture system has them", **device}},
     )
 
 
-def angle_channels(
-    t_ns: NDArray[np.int64],
-    names: Sequence[str],
-    pos: FloatArray,
-    report: ReportBuilder,
-    options: MarkerOptions,
-) -> list[tuple[ChannelSpec, pl.DataFrame]]:
-    """Return ``/reference/optical/joint`` and ``…/<segment>/orientation`` as far as the markers say them.
+class _Reference:
+    """What markers say of joints and segments, window by window: the first says what is constant in the capture."""
 
-    Shapes: ``t_ns`` (n,), ``pos`` (n, markers, 3) in m.
-    """
-    if options.angles == "off":
-        return []
-    roles = {}
-    for pair in (options.landmarks or "").replace(" ", "").split(","):
-        marker, colon, role = pair.partition(":")
-        if pair and not colon:
-            raise UsageError(
-                f"option landmarks: {pair!r} is no MARKER:LANDMARK pair, such as RLE:right_knee_lat"
-            )
-        if pair:
-            roles[marker] = role
-    seen = np.where((pos == 0).all(axis=2, keepdims=True), np.nan, pos)
-    try:
-        angles = from_markers(t_ns.astype(np.float64) * 1e-9, names, seen, options.angles, roles)
-    except ValueError as error:
-        raise UsageError(f"option landmarks: {error}") from None
-    for doubt in angles.doubts:
-        report.note("reference_doubt", doubt, subject=doubt)
-    if options.side is not None:
-        start = f"{options.side}_"
-        angles = ReferenceAngles(
+    def __init__(self, names: Sequence[str], options: MarkerOptions, report: ReportBuilder) -> None:
+        self._names, self._options, self._report = names, options, report
+        self._constants: dict[Any, Any] = {}
+        self._rows = self._hidden = 0
+        self._first_hidden: tuple[int, int] | None = None
+        self._remarks: dict[str, str] = {}
+        self._lost: dict[str, int] = {}
+
+    def of(self, frame: pl.DataFrame) -> list[tuple[ChannelSpec, pl.DataFrame]]:
+        """Return ``/reference/optical/joint`` and ``…/<segment>/orientation`` of a window, as markers say them."""
+        pos = frame.select(marker_columns(self._names)).to_numpy().reshape(frame.height, -1, 3)
+        hidden = np.isnan(pos).any(axis=2)
+        if hidden.any() and self._first_hidden is None:
+            row, k = (int(i[0]) for i in np.nonzero(hidden))
+            self._first_hidden = self._rows + row, k
+        self._hidden += int(hidden.sum())
+        head = not self._rows
+        self._rows += frame.height
+        if self._options.angles == "off":
+            return []
+        seen = np.where((pos == 0).all(axis=2, keepdims=True), np.nan, pos)
+        angles = self._angles(frame["t"].to_numpy(), seen)
+        if head:
+            self._remarks = angles.remarks
+            for doubt in angles.doubts:
+                self._report.note("reference_doubt", doubt, subject=doubt)
+        for name in self._remarks:
+            self._lost[name] = self._lost.get(name, 0) + int((~np.isfinite(angles.angle[name])).sum())
+        return reference_channels(angles)
+
+    def _angles(self, t_ns: NDArray[np.int64], seen: FloatArray) -> ReferenceAngles:
+        roles = {}
+        for pair in (self._options.landmarks or "").replace(" ", "").split(","):
+            marker, colon, role = pair.partition(":")
+            if pair and not colon:
+                raise UsageError(
+                    f"option landmarks: {pair!r} is no MARKER:LANDMARK pair, such as RLE:right_knee_lat"
+                )
+            if pair:
+                roles[marker] = role
+        t, how = t_ns.astype(np.float64) * 1e-9, self._options.angles
+        try:
+            angles = from_markers(t, self._names, seen, how, roles, self._constants)
+        except ValueError as error:
+            raise UsageError(f"option landmarks: {error}") from None
+        if self._options.side is None:
+            return angles
+        start = f"{self._options.side}_"
+        return ReferenceAngles(
             angle={name.removeprefix(start): v for name, v in angles.angle.items()},
             rot={name.removeprefix(start): v for name, v in angles.rot.items()},
             remarks={name.removeprefix(start): v for name, v in angles.remarks.items()},
+            doubts=angles.doubts,
         )
-    return reference_channels(angles, report)
+
+    def finish(self) -> None:
+        """Say how much was not seen, and by which definition the angles are."""
+        if self._first_hidden is not None:
+            row, k = self._first_hidden
+            share = 100 * (self._hidden / (self._rows * len(self._names)))
+            self._report.note(
+                "missing_cell",
+                f"{MARKERS_TOPIC}: {share:.2g} % of the positions are missing (first {self._names[k]}): NaN",
+                count=self._hidden,
+                line=row + 1,
+                subject="hidden",
+            )
+        for name, loss in self._remarks.items():
+            share = 100.0 * (self._lost[name] / self._rows)
+            self._report.note(
+                "reference_angle",
+                f"{ANGLES_TOPIC} {name}: {loss}; {share:.2g} % of the frames without",
+                subject=name,
+            )
 
 
-def reference_channels(
-    angles: ReferenceAngles, report: ReportBuilder
-) -> list[tuple[ChannelSpec, pl.DataFrame]]:
-    """Return the channels of reference angles and attitudes, and say by which definition they are."""
+def reference_channels(angles: ReferenceAngles) -> list[tuple[ChannelSpec, pl.DataFrame]]:
+    """Return the channels of reference angles and attitudes."""
     from scipy.spatial.transform import Rotation
 
     channels = []
@@ -341,13 +385,6 @@ def reference_channels(
         table = pl.DataFrame(angles.angle)
         metadata = {"sign": "upper - lower segment", **angles.remarks}
         channels.append((ChannelSpec(ANGLES_TOPIC, JOINTS, "", tuple(table.columns), metadata), table))
-        for name, loss in angles.remarks.items():
-            lost = 100.0 * float(np.mean(~np.isfinite(angles.angle[name])))
-            report.note(
-                "reference_angle",
-                f"{ANGLES_TOPIC} {name}: {loss}; {lost:.2g} % of the frames without",
-                subject=name,
-            )
     for segment, rot in angles.rot.items():
         quat = np.full((len(rot), 4), np.nan)
         good = np.isfinite(rot).all(axis=(1, 2))

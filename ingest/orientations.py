@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Annotated
 
 import msgspec
@@ -11,8 +11,9 @@ import polars as pl
 from numpy.typing import NDArray
 
 from ..recording.errors import UsageError
-from .anatomy import FUNCTIONAL, JOINTS, SIDES, FloatArray, functional, twist
+from .anatomy import JOINTS, SIDES
 from .contract import ChannelSpec, CommonOptions, ReportBuilder
+from .jointangles import FUNCTIONAL, AxisTurn, FloatArray
 from .leg import JOINTS as JOINT_SCHEMA
 from .leg import QUAT
 from .optical import ANGLES_TOPIC
@@ -21,6 +22,10 @@ DEVICE_TOPIC = "/reference/device/joint"
 """Angles of the orientations that the sensors' own filter states: beside an optical reference it does not count."""
 GAP_NS = 100_000_000
 """Orientations are not interpolated between samples farther apart."""
+ROWS = 65_536
+"""Rows of a window of angles; the first says what is constant."""
+MOST_WINDOWS = 4
+"""So many windows of one segment wait for the orientations of another one."""
 
 
 class OrientationOptions(CommonOptions, frozen=True, kw_only=True):
@@ -89,42 +94,102 @@ def with_angles(
     spec = ChannelSpec(
         topic, JOINT_SCHEMA, "", tuple(joints), {"sign": "upper - lower segment", "definition": how}
     )
-    return [*channels, spec], _behind(blocks, joints, topic, axis, how, report)
+
+    def say(joint: str) -> None:
+        report.note("reference_angle", f"{topic} {joint}: {how}", subject=joint)
+
+    wanted = {t for pair in joints.values() for t in pair}
+    return [*channels, spec], _behind(blocks, wanted, topic, _Angles(joints, axis, say))
+
+
+def in_step(streams: Sequence[Iterator[tuple[str, pl.DataFrame]]]) -> Iterator[tuple[str, pl.DataFrame]]:
+    """Yield the blocks of sources of one clock, always of the one that is behind: little waits for the others."""
+    times = dict.fromkeys(range(len(streams)), -(2**63))
+    while times:
+        behind = min(times, key=lambda k: times[k])
+        block = next(streams[behind], None)
+        if block is None:
+            del times[behind]
+            continue
+        if block[1].height:
+            times[behind] = int(block[1]["t_ns"][-1])
+        yield block
 
 
 def _behind(
-    blocks: Iterable[tuple[str, pl.DataFrame]],
-    joints: dict[str, tuple[str, str]],
-    own: str,
-    axis: FloatArray | None,
-    how: str,
-    report: ReportBuilder,
+    blocks: Iterable[tuple[str, pl.DataFrame]], wanted: set[str], own: str, angles: _Angles
 ) -> Iterator[tuple[str, pl.DataFrame]]:
-    wanted = {topic for pair in joints.values() for topic in pair}
-    kept: dict[str, list[pl.DataFrame]] = {}
     for topic, table in blocks:
-        if topic in wanted:
-            kept.setdefault(topic, []).append(table)
         yield topic, table
-    tables = {topic: pl.concat(parts) for topic, parts in kept.items()}
-    pairs = {name: pair for name, pair in joints.items() if set(pair) <= set(tables)}
-    if not pairs:
-        return
-    first = next(iter(pairs.values()))[0]
-    t_ns = tables[first]["t_ns"].to_numpy()
-    angles = {}
-    for name in joints:
-        angle = np.full(len(t_ns), np.nan)
-        if name in pairs:
-            upper, lower = (resampled(tables[topic], t_ns) for topic in pairs[name])
-            if axis is not None:
-                angle = twist(upper, lower, axis)
-            else:
-                fitted = functional(t_ns * 1e-9, upper, lower, -1.0 if name.endswith("hip") else 1.0)
-                angle = angle if fitted is None else fitted
-            report.note("reference_angle", f"{own} {name}: {how}", subject=name)
-        angles[name] = angle
-    yield own, pl.DataFrame({"t_ns": t_ns, **angles})
+        if topic in wanted:
+            angles.add(topic, table)
+            yield from ((own, window) for window in angles.windows(final=False))
+    yield from ((own, window) for window in angles.windows(final=True))
+
+
+class _Angles:
+    """Angles of joints, window by window of the times of one segment, from orientations that come in blocks.
+
+    The first window says what is constant (:class:`.jointangles.AxisTurn`).
+    """
+
+    def __init__(
+        self,
+        joints: dict[str, tuple[str, str]],
+        axis: FloatArray | None,
+        say: Callable[[str], None],
+    ) -> None:
+        self._joints, self._say = joints, say
+        self._turns = {n: AxisTurn(axis, -1.0 if n.endswith("hip") else 1.0) for n in joints}
+        self._tables: dict[str, pl.DataFrame] = {}  # from the row before the next window on
+        self._pairs: dict[str, tuple[str, str]] = {}  # joints whose segments both have orientations
+        self._row = 0  # of the table whose times are taken: begin of the next window
+
+    def add(self, topic: str, table: pl.DataFrame) -> None:
+        """Take a block of orientations."""
+        before = self._tables.get(topic)
+        self._tables[topic] = table if before is None else pl.concat([before, table])
+
+    def windows(self, *, final: bool) -> Iterator[pl.DataFrame]:
+        """Yield the angles of the windows for which all orientations are there."""
+        while True:
+            late = final or any(t.height > MOST_WINDOWS * ROWS for t in self._tables.values())
+            if not self._pairs:
+                pairs = {n: pair for n, pair in self._joints.items() if set(pair) <= set(self._tables)}
+                if not pairs or not (late or len(pairs) == len(self._joints)):
+                    return
+                self._pairs = pairs
+                for name in pairs:
+                    self._say(name)
+            first = next(iter(self._pairs.values()))[0]
+            times = self._tables[first]["t_ns"].to_numpy()[self._row :]
+            t_ns = times[:ROWS]
+            if not t_ns.size or not (final or times.size > ROWS):
+                return
+            if not late and any(table["t_ns"][-1] < t_ns[-1] for table in self._tables.values()):
+                return
+            yield self._window(t_ns)
+            self._row += t_ns.size
+            if times.size > ROWS:
+                self._forget(first, times[ROWS])
+
+    def _window(self, t_ns: NDArray[np.int64]) -> pl.DataFrame:
+        angles = {name: np.full(len(t_ns), np.nan) for name in self._joints}
+        for name, pair in self._pairs.items():
+            upper, lower = (resampled(self._tables[topic], t_ns) for topic in pair)
+            angle = self._turns[name].angle(t_ns.astype(np.float64) * 1e-9, upper, lower)
+            angles[name] = angles[name] if angle is None else angle
+        return pl.DataFrame({"t_ns": t_ns, **angles})
+
+    def _forget(self, first: str, t_ns: int) -> None:
+        """Keep of every table what a time needs: the row before it (the first of that row's time) and all later."""
+        for topic, table in self._tables.items():
+            t = table["t_ns"].to_numpy()
+            before = max(0, int(np.searchsorted(t, t_ns)) - 1)
+            k = int(np.searchsorted(t, t[before]))
+            self._tables[topic] = table[k:]
+            if topic == first:
+                self._row -= k
 
 
 def resampled(table: pl.DataFrame, t_ns: NDArray[np.int64]) -> FloatArray:

@@ -11,15 +11,13 @@ import pytest
 from marcha.ingest import convert
 from marcha.ingest.anatomy import (
     anatomy,
-    cardan,
     carried,
     cluster_attitude,
     from_markers,
-    functional,
     name_of,
-    planar,
-    twist,
+    place_in_cluster,
 )
+from marcha.ingest.jointangles import AxisTurn, cardan, planar
 from marcha.ingest.orientations import axis_of, resampled
 from marcha.ingest.simulate.leg import leg
 from marcha.recording import UsageError
@@ -61,7 +59,7 @@ def test_planar_and_twist_agree_where_the_joint_is_a_hinge() -> None:
     lower = upper * Rotation.from_rotvec(np.outer(-k, [1, 0, 0]))
     up, low = upper.as_matrix(), lower.as_matrix()
     np.testing.assert_allclose(planar(up[:, :, 2], low[:, :, 2], up[:, :, 0]), k, atol=1e-9)
-    np.testing.assert_allclose(twist(up, low, np.array([1.0, 0, 0])), k, atol=1e-9)
+    np.testing.assert_allclose(AxisTurn(np.array([1.0, 0, 0])).angle(k, up, low), k, atol=1e-9)
     np.testing.assert_allclose(cardan(up, low)[:, 0], k, atol=1e-9)
 
 
@@ -75,7 +73,9 @@ def test_a_cluster_carries_its_landmark_and_nothing_is_interpolated() -> None:
     pos[600:700, plate[:2]] = np.nan  # two of four: no attitude there
     rot, place, _, misfit = cluster_attitude(pos[:, plate])
     assert misfit < 0.001
-    filled = carried(pos[:, knee], rot, place)
+    own = place_in_cluster(pos[:, knee], rot, place)
+    assert own is not None
+    filled = carried(pos[:, knee], rot, place, own)
     assert np.isnan(filled[600:700]).all()
     error = np.linalg.norm(filled - true, axis=1)
     assert np.nanmax(error) < 0.01
@@ -96,7 +96,7 @@ def test_clusters_without_landmarks_give_the_turn_about_their_main_axis() -> Non
         -np.degrees(seen.angle["knee"][:100].mean()), abs=0.3
     )  # zero at rest
     assert found.remarks["knee"].startswith("functional")
-    assert functional(seen.t, seen.rot_ns["thigh"], seen.rot_ns["thigh"], 1.0) is None
+    assert AxisTurn().angle(seen.t, seen.rot_ns["thigh"], seen.rot_ns["thigh"]) is None
 
 
 @pytest.mark.parametrize(

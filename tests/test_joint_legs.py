@@ -10,7 +10,7 @@ import pytest
 from marcha.algorithms import make
 from marcha.algorithms.joint.chain import measure_angles
 from marcha.ingest import convert
-from marcha.ingest.anatomy import cardan
+from marcha.ingest.jointangles import cardan
 from marcha.ingest.simulate import simulate
 from marcha.replay import Run, evaluate, replay
 from scipy.spatial.transform import Rotation

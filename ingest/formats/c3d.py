@@ -19,7 +19,7 @@ import polars as pl
 from ...recording.errors import MarchaError, UsageError
 from ..contract import ChannelSpec, Import, ReportBuilder
 from ..leg import unique_markers
-from ..optical import MarkerOptions, blocks_of, marker_import
+from ..optical import MarkerOptions, blocks_of, marker_import, marker_table
 from ..timestamps import MOST_NS, nanoseconds, possible_rate
 from ..units import conversion
 
@@ -102,9 +102,9 @@ class C3d:
         device = {"time": "frames at the header's rate; frame 1 is at 0", "rate_hz": f"{rate:g}"}
         analog = _analog(path, head, signals)
         if pos.shape[1]:
-            markers = marker_import(
-                t_ns, np.arange(1, len(pos) + 1), names, pos * factor, report, device, options
-            )
+            frame = pl.DataFrame({"t": t_ns, "line": np.arange(1, len(pos) + 1)})
+            frame = frame.hstack(marker_table(names, pos * factor))
+            markers = marker_import([frame], names, report, device, options)
             channels, blocks = list(markers.channels), markers.blocks()
         else:
             channels, blocks = [], iter(())

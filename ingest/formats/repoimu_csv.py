@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
-
-import polars as pl
 
 from ...recording.errors import MarchaError
 from ..contract import HEAD_BYTES, ChannelSpec, Import, ReportBuilder
@@ -23,7 +21,7 @@ from ..leg import (
     rotations,
 )
 from ..mapping import CellSource, Mapping, TextLayout, Time, Topic
-from ..orientations import OrientationOptions, with_angles
+from ..orientations import OrientationOptions, in_step, with_angles
 from ..text import read_blocks
 from .table import open_table
 
@@ -74,7 +72,7 @@ class RepoImuCsv:
             channels += specs
             streams.append(rotations(blocks, [f"/reference/{names[key]}/orientation"], report))
         note_arbitrary(report, [f"/leg/{n}/mag" for n in names.values()], options.field_ut)
-        channels, blocks = with_angles(channels, _chained(streams), options, report)
+        channels, blocks = with_angles(channels, in_step(streams), options, report)
         return Import(
             channels=channels,
             blocks=blocks,
@@ -126,8 +124,3 @@ def _mapping(segment: str, tesla: float) -> Mapping:
     ]
     layout = TextLayout(separator=";", header=False, skip_rows=2)
     return Mapping(topic=topics, time=Time(column=1, unit="s"), layout=layout)
-
-
-def _chained(streams: Sequence[Iterator[tuple[str, pl.DataFrame]]]) -> Iterator[tuple[str, pl.DataFrame]]:
-    for stream in streams:
-        yield from stream

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, ClassVar
 
 import msgspec
 import numpy as np
+import polars as pl
 
 from ...recording.errors import MarchaError, UsageError
 from ..contract import Import, ReportBuilder
 from ..leg import unique_markers
-from ..optical import MarkerOptions, float_rows, marker_import, read_text
+from ..optical import MarkerOptions, float_windows, marker_import, marker_table
+from ..text import text_lines
 from ..timestamps import nanoseconds
 from ..units import conversion
 
@@ -44,7 +46,7 @@ class Trc:
     def read(self, paths: Sequence[Path], options: TrcOptions) -> Import:
         """Read one file."""
         path = paths[0]
-        lines = read_text(path).split("\n")
+        _, lines = next(text_lines(path), (1, [""]))
         if len(lines) < 6 or not lines[0].startswith("PathFileType"):
             raise MarchaError(
                 f"{path}, line 1: not the header of a TRC file (PathFileType, five lines, rows)"
@@ -65,20 +67,33 @@ class Trc:
         if stated.isdigit() and int(stated) != len(names):
             report.note("header_doubt", f"NumMarkers is {stated}, but {len(names)} markers are named", line=3)
         columns = ["Frame#", "Time", *(f"{n} {a}" for n in names for a in "XYZ")]
-        values, rows = float_rows(path, lines[5:], 6, "\t", columns, report)
-        stated = facts.get("NumFrames", "")
-        if stated.isdigit() and int(stated) != len(values):
-            report.note("header_doubt", f"NumFrames is {stated}, but there are {len(values)} rows", line=3)
-        timeless = np.isnan(values[:, 1])
-        if timeless.any():
-            first = int(np.argmax(timeless))
-            report.drop(
-                "bad_row", "a row without a time; dropped", count=int(timeless.sum()), line=int(rows[first])
-            )
-            values, rows = values[~timeless], rows[~timeless]
-        t_ns = nanoseconds(values[:, 1], 1e9)
-        pos = values[:, 2:].reshape(len(values), -1, 3) * factor
-        if options.y_up:
-            pos = pos[..., [0, 2, 1]] * np.array([1.0, -1.0, 1.0])
+        windows = float_windows(path, text_lines(path, 5), "\t", columns, report)
+
+        def frames() -> Iterator[pl.DataFrame]:
+            count = kept = 0
+            for values, rows in windows:
+                count += len(values)
+                timeless = np.isnan(values[:, 1])
+                if timeless.any():
+                    first = int(np.argmax(timeless))
+                    report.drop(
+                        "bad_row",
+                        "a row without a time; dropped",
+                        count=int(timeless.sum()),
+                        line=int(rows[first]),
+                    )
+                    values, rows = values[~timeless], rows[~timeless]
+                kept += len(values)
+                pos = values[:, 2:].reshape(len(values), -1, 3) * factor
+                if options.y_up:
+                    pos = pos[..., [0, 2, 1]] * np.array([1.0, -1.0, 1.0])
+                times = pl.DataFrame({"t": nanoseconds(values[:, 1], 1e9), "line": rows})
+                yield times.hstack(marker_table(names, pos))
+            if not kept:
+                raise MarchaError(f"{path}: no row has a time; nothing to convert")
+            stated = facts.get("NumFrames", "")
+            if stated.isdigit() and int(stated) != count:
+                report.note("header_doubt", f"NumFrames is {stated}, but there are {count} rows", line=3)
+
         device = {"time": "column Time (s)", "rate_hz": facts.get("DataRate", "")}
-        return marker_import(t_ns, rows, names, pos, report, device, options)
+        return marker_import(frames(), names, report, device, options)

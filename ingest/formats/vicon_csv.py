@@ -3,29 +3,68 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+import sys
+from collections import deque
+from collections.abc import Iterator, Sequence
+from hashlib import blake2b
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from ...recording.errors import MarchaError, UsageError
 from ..contract import ChannelSpec, Import, ReportBuilder
 from ..leg import JOINT_TOPIC, JOINTS, unique_markers
-from ..optical import FloatArray, MarkerOptions, blocks_of, float_rows, marker_import, read_text
+from ..optical import FloatArray, MarkerOptions, beside_each_other, blocks_of, float_windows, marker_import
+from ..text import text_lines
 from ..timestamps import nanoseconds, possible_rate
 from ..units import conversion
 
 SECTIONS = ("Trajectories", "Model Outputs")
+SOURCE = "Vicon Model Outputs; x (flexion), then y and z of each angle"
 
 
 class _Section(NamedTuple):
+    path: Path
     rate_hz: float
     names: list[str]
     units: list[str]
-    values: FloatArray  # frame, sub frame, x, y, z of every name
-    lines: np.ndarray
+    separator: str
+    first: int
+    """Its first line of numbers."""
+    end: int = sys.maxsize
+    """The line behind its last one."""
+
+    def windows(self, report: ReportBuilder) -> Iterator[tuple[FloatArray, NDArray[np.int64]]]:
+        """Yield frame, sub frame, x, y, z of every name, and lines."""
+
+        def pieces() -> Iterator[tuple[int, list[str]]]:
+            for line, lines in text_lines(self.path, self.first - 1):
+                if line >= self.end:
+                    return
+                yield line, lines[: self.end - line]
+
+        columns = ["Frame", "Sub Frame", *(f"{n} {a}" for n in self.names for a in "XYZ")]
+        return float_windows(self.path, pieces(), self.separator, columns, report)
+
+    def frames(
+        self, columns: Sequence[tuple[str, int, float]], report: ReportBuilder
+    ) -> Iterator[pl.DataFrame]:
+        """Yield ``t`` (ns), ``line`` and columns: name, place behind the sub frame, factor."""
+        for values, lines in self.windows(report):
+            t_ns = nanoseconds(values[:, 0] - 1, 1e9 / self.rate_hz)
+            yield pl.DataFrame(
+                {"t": t_ns, "line": lines} | {name: values[:, 2 + k] * factor for name, k, factor in columns}
+            )
+
+    def counted(self) -> bytes:
+        """Return a digest of the numbers of its frames."""
+        digest = blake2b()
+        for values, _ in self.windows(ReportBuilder()):
+            digest.update(values[:, 0].tobytes())
+        return digest.digest()
 
 
 class ViconCsv:
@@ -47,51 +86,70 @@ class ViconCsv:
     def read(self, paths: Sequence[Path], options: MarkerOptions) -> Import:
         """Read one file."""
         path = paths[0]
-        lines = read_text(path).split("\n")
         report = ReportBuilder()
-        sections = {
-            _word(lines[k]): _section(path, lines, k, report)
-            for k in range(len(lines) - 3)
-            if _starts(lines, k) and _word(lines[k]) in SECTIONS
-        }
+        sections = _sections(path)
         if not sections:
             raise MarchaError(
                 f"{path}: has neither a section Trajectories nor Model Outputs with their headers"
             )
-        angles = _angles(sections["Model Outputs"]) if "Model Outputs" in sections else None
-        marks = sections.get("Trajectories")
+        modelled, marks = sections.get("Model Outputs"), sections.get("Trajectories")
+        angles = _angles(modelled) if modelled is not None else {}
+        spec = ChannelSpec(JOINT_TOPIC, JOINTS, "", tuple(angles), {"source": SOURCE})
         device = {"time": "frames at the section's rate; frame 1 is at 0"}
         if marks is None:
-            assert angles is not None or not sections
-            if angles is None:
+            if modelled is None or not angles:
                 raise MarchaError(f"{path}: its Model Outputs hold no angles (deg, rad)")
-            spec, table, section = angles
-            blocks = blocks_of([(_times(section), section.lines, [(spec.topic, table)])], report)
+            frames = modelled.frames([(n, *source) for n, source in angles.items()], report)
+            windows = (
+                (f["t"].to_numpy(), f["line"].to_numpy(), [(spec.topic, f.drop("t", "line"))]) for f in frames
+            )
             return Import(
                 channels=[spec],
-                blocks=blocks,
+                blocks=blocks_of(windows, report),
                 report=report,
                 metadata={"device": {"clock": "device", **device}},
             )
         names = unique_markers([n.rpartition(":")[2] for n in marks.names], path, 1)
-        factors = []
-        for name, unit in zip(names, marks.units, strict=True):
+        columns = []
+        for k, (name, unit) in enumerate(zip(names, marks.units, strict=True)):
             try:
-                factors.append(conversion(unit, "m")[0])
+                factor = conversion(unit, "m")[0]
             except UsageError as error:
                 raise MarchaError(f"{path}: marker {name}: {error}") from None
-        pos = marks.values[:, 2:].reshape(len(marks.values), -1, 3) * np.array(factors)[:, None]
+            columns += [(f"{name}.{a}", 3 * k + j, factor) for j, a in enumerate("xyz")]
+        frames = marks.frames(columns, report)
         more = []
-        if angles is not None:
-            spec, table, section = angles
-            if np.array_equal(section.values[:, 0], marks.values[:, 0]) and section.rate_hz == marks.rate_hz:
-                more = [(spec, table)]
+        if modelled is not None and angles:
+            if modelled.rate_hz == marks.rate_hz and modelled.counted() == marks.counted():
+                more = [spec]
+                beside = modelled.frames(
+                    [(f"{spec.topic} {n}", *source) for n, source in angles.items()], report
+                )
+                frames = beside_each_other(frames, beside)
             else:
                 report.note(
                     "unused_column", "Model Outputs are of other frames than Trajectories: not imported"
                 )
         device["rate_hz"] = f"{marks.rate_hz:g}"
-        return marker_import(_times(marks), marks.lines, names, pos, report, device, options, more)
+        return marker_import(frames, names, report, device, options, more)
+
+
+def _sections(path: Path) -> dict[str, _Section]:
+    """Return the sections of a file by their names; of those with one name the last."""
+    sections: dict[str, _Section] = {}
+    before: deque[str] = deque(maxlen=4)
+    name = ""  # of the section whose rows are read
+    for first, lines in text_lines(path):
+        for number, line in enumerate(lines, first):
+            if len(before) == 4 and "Sub Frame" in before[3] and _starts(before, 0):
+                name = _word(before[0])
+                if name in SECTIONS:
+                    sections[name] = _section(path, before, line, number)
+            elif name in sections and not line.strip(sections[name].separator + ' "'):
+                sections[name] = sections[name]._replace(end=number)
+                name = ""
+            before.append(line)
+    return sections
 
 
 def _word(line: str) -> str:
@@ -106,40 +164,30 @@ def _starts(lines: Sequence[str], k: int) -> bool:
     return rate is not None and re.match(r'"?Frame"?[,;\t]"?Sub Frame', lines[k + 3]) is not None
 
 
-def _section(path: Path, lines: Sequence[str], k: int, report: ReportBuilder) -> _Section:
-    separator = next(c for c in ",;\t" if c in lines[k + 3])
-    header = [c.strip().strip('"') for c in lines[k + 2].split(separator)]
+def _section(path: Path, head: Sequence[str], below: str, line: int) -> _Section:
+    """Return a section of its four lines of headers and the line of units, the ``line``-th of the file."""
+    separator = next(c for c in ",;\t" if c in head[3])
+    header = [c.strip().strip('"') for c in head[2].split(separator)]
     names = [c for c in header[2:] if c]
-    axes = [c.strip().strip('"') for c in lines[k + 3].rstrip(separator + " ").split(separator)]
+    axes = [c.strip().strip('"') for c in head[3].rstrip(separator + " ").split(separator)]
     if axes[2:] != ["X", "Y", "Z"] * len(names):
         raise MarchaError(
-            f"{path}, line {k + 4}: {len(names)} names above {len(axes) - 2} columns, not X, Y, Z each"
+            f"{path}, line {line - 1}: {len(names)} names above {len(axes) - 2} columns, not X, Y, Z each"
         )
-    units = [c.strip().strip('"') for c in lines[k + 4].split(separator)]
-    first = k + 5
-    end = next((j for j in range(first, len(lines)) if not lines[j].strip(separator + ' "')), len(lines))
-    columns = ["Frame", "Sub Frame", *(f"{n} {a}" for n in names for a in "XYZ")]
-    values, rows = float_rows(path, lines[first:end], first + 1, separator, columns, report)
+    units = [c.strip().strip('"') for c in below.split(separator)]
     per_name = [units[2 + 3 * i] if len(units) > 2 + 3 * i else "" for i in range(len(names))]
-    rate = possible_rate(float(_word(lines[k + 1])), path, f"correct line {k + 2}")
-    return _Section(rate, names, per_name, values, rows)
+    rate = possible_rate(float(_word(head[1])), path, f"correct line {line - 3}")
+    return _Section(path, rate, names, per_name, separator, line + 1)
 
 
-def _times(section: _Section) -> np.ndarray:
-    return nanoseconds(section.values[:, 0] - 1, 1e9 / section.rate_hz)
+def _angles(section: _Section) -> dict[str, tuple[int, float]]:
+    """Return place and factor of modelled angles, ``<name>``, ``<name>_y``, ``<name>_z`` (rad).
 
-
-def _angles(section: _Section) -> tuple[ChannelSpec, pl.DataFrame, _Section] | None:
-    """Return modelled angles as ``<name>``, ``<name>_y``, ``<name>_z`` (rad), x being flexion in Vicon's models."""
-    columns = {}
-    for k, (name, unit) in enumerate(zip(section.names, section.units, strict=True)):
-        if unit not in ("deg", "rad"):
-            continue
-        for j, tail in enumerate(("", "_y", "_z")):
-            value = section.values[:, 2 + 3 * k + j]
-            columns[name.rpartition(":")[2] + tail] = np.radians(value) if unit == "deg" else value
-    if not columns:
-        return None
-    metadata = {"source": "Vicon Model Outputs; x (flexion), then y and z of each angle"}
-    spec = ChannelSpec(JOINT_TOPIC, JOINTS, "", tuple(columns), metadata)
-    return spec, pl.DataFrame(columns), section
+    x is flexion in Vicon's models.
+    """
+    return {
+        name.rpartition(":")[2] + tail: (3 * k + j, np.pi / 180 if unit == "deg" else 1.0)
+        for k, (name, unit) in enumerate(zip(section.names, section.units, strict=True))
+        if unit in ("deg", "rad")
+        for j, tail in enumerate(("", "_y", "_z"))
+    }
