@@ -17,6 +17,9 @@ FloatArray = NDArray[np.float64]
 
 #: Readings of a sensor that are looked at: an hour at 100 Hz.
 MOST_ROWS = 360_000
+#: Rows of all sensors and the encoders together that are looked at: an hour of three sensors, half of seven.
+MOST_ROWS_IN_ALL = 4 * MOST_ROWS
+_WATCHED = re.compile(r"/leg/[^/]+/imu|/leg/encoder")
 #: Below this rate (rad/s, rms about its median) a sensor is still; above the other one moves.
 STILL_RATE, MOVING_RATE = 0.02, 0.3
 #: A silence of more nominal intervals and more seconds than these is said of the sensor.
@@ -40,17 +43,18 @@ class LegWatch:
     """
 
     def __init__(self, channels: Sequence[ChannelSpec]) -> None:
-        self._specs = {c.topic: c for c in channels}
+        self._specs = {c.topic: c for c in channels if _WATCHED.fullmatch(c.topic)}
+        self._most = min(MOST_ROWS, MOST_ROWS_IN_ALL // max(1, len(self._specs)))
         self._parts: dict[str, list[pl.DataFrame]] = {}
         self._rows: dict[str, int] = {}
 
     def feed(self, topic: str, table: pl.DataFrame) -> None:
         """Keep what is needed of a block."""
-        if not (re.fullmatch(r"/leg/[^/]+/imu", topic) or topic == "/leg/encoder"):
+        if topic not in self._specs:
             return
         have = self._rows.get(topic, 0)
-        if have < MOST_ROWS:
-            self._parts.setdefault(topic, []).append(table[: MOST_ROWS - have])
+        if have < self._most:
+            self._parts.setdefault(topic, []).append(table[: self._most - have])
             self._rows[topic] = have + table.height
 
     def finish(self, report: Report) -> Report:
