@@ -7,7 +7,7 @@ to name its columns (option ``columns``).
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -17,7 +17,7 @@ import polars as pl
 
 from ..recording.errors import MarchaError, UsageError
 from .contract import ReportBuilder
-from .text import BOM, read_whole, start_of
+from .text import BOM, start_of, text_lines
 
 UNIT = re.compile(r"[\[(]([^\])]*)[\])]")
 DECIMAL_COMMA = r"^([+-]?\d+),(\d+)$"
@@ -101,40 +101,50 @@ def named_columns(text: str) -> dict[str, str]:
 def read_cells(
     path: Path, places: Mapping[str, int], header: TableHeader, report: ReportBuilder
 ) -> pl.DataFrame:
-    """Return the cells of a table as text by role, with ``line``; rows of another width are dropped and said.
+    """Return all cells of a table, as :func:`cell_windows` reads them."""
+    return pl.concat(cell_windows(path, places, header, report))
+
+
+def cell_windows(
+    path: Path, places: Mapping[str, int], header: TableHeader, report: ReportBuilder
+) -> Iterator[pl.DataFrame]:
+    """Yield the cells of a table as text by role, with ``line``; rows of another width are dropped and said.
 
     Raises
     ------
     MarchaError
         The file cannot be read or has no row.
     """
-    text = read_whole(path).decode("utf-8-sig", "replace")
-    lines = pl.Series("row", text.replace("\r\n", "\n").split("\n")[1:], dtype=pl.String)
-    rows = pl.DataFrame({"row": lines, "line": np.arange(2, len(lines) + 2)}).filter(
-        pl.col("row").str.strip_chars() != ""
-    )
-    if rows.is_empty():
+    width, commas, empty = len(header.names), 0, True
+    for first, lines in text_lines(path, 1):
+        rows = pl.DataFrame(
+            {"row": pl.Series(lines, dtype=pl.String), "line": np.arange(first, first + len(lines))}
+        ).filter(pl.col("row").str.strip_chars() != "")
+        if rows.is_empty():
+            continue
+        empty = False
+        fits = rows["row"].str.count_matches(header.separator, literal=True) == width - 1
+        if not fits.all():
+            bad = rows.filter(~fits)
+            report.drop(
+                "bad_row",
+                f"{path.name}: {bad['row'][0][:40]!r}: not {width} cells as the header has; dropped",
+                count=bad.height,
+                line=bad["line"][0],
+                subject=path.name,
+            )
+        rows = rows.filter(fits)
+        parts = rows["row"].str.split_exact(header.separator, width - 1).struct.unnest()
+        cells = {role: parts[f"field_{i}"].str.strip_chars(' "') for role, i in places.items()}
+        if header.separator != ",":
+            count = sum(int(text.str.contains(DECIMAL_COMMA).sum()) for text in cells.values())
+            if count:
+                commas += count
+                cells = {r: text.str.replace(DECIMAL_COMMA, "${1}.${2}") for r, text in cells.items()}
+        yield pl.DataFrame({"line": rows["line"], **cells})
+    if empty:
         raise MarchaError(f"{path}: a header and no row; nothing to convert")
-    width = len(header.names)
-    fits = rows["row"].str.count_matches(header.separator, literal=True) == width - 1
-    if not fits.all():
-        bad = rows.filter(~fits)
-        report.drop(
-            "bad_row",
-            f"{path.name}: {bad['row'][0][:40]!r}: not {width} cells as the header has; dropped",
-            count=bad.height,
-            line=bad["line"][0],
-            subject=path.name,
-        )
-    rows = rows.filter(fits)
-    parts = rows["row"].str.split_exact(header.separator, width - 1).struct.unnest()
-    cells = {role: parts[f"field_{i}"].str.strip_chars(' "') for role, i in places.items()}
-    if header.separator != ",":
-        count = sum(int(text.str.contains(DECIMAL_COMMA).sum()) for text in cells.values())
-        if count:
-            report.note("decimal_comma", f"{path.name}: decimal commas are read as points", count=count)
-            cells = {r: text.str.replace(DECIMAL_COMMA, "${1}.${2}") for r, text in cells.items()}
-    return pl.DataFrame({"line": rows["line"], **cells})
+    report.note("decimal_comma", f"{path.name}: decimal commas are read as points", count=commas)
 
 
 def numbers(cells: pl.DataFrame, roles: tuple[str, ...], path: Path, report: ReportBuilder) -> pl.DataFrame:

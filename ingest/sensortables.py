@@ -1,6 +1,6 @@
 """Tables of Sensor Logger as its exports hold them: CSV files of a folder, one JSON file, one SQLite database.
 
-CSV is read in pieces and never held; JSON and SQLite are.
+All are read in pieces and never held; JSON once for each sensor.
 """
 
 from __future__ import annotations
@@ -8,14 +8,16 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
+import re
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
-from itertools import islice
+from functools import partial
+from itertools import chain, islice
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-import numpy as np
 import polars as pl
 
 from ..recording.errors import MarchaError
@@ -23,7 +25,7 @@ from ..recording.files import read_small
 from .cells import NoRowError
 from .columns import careful_block, float_blocks, require_header
 from .contract import ReportBuilder
-from .text import start_of
+from .text import BLOCK_BYTES, start_of
 
 WANTED = "time,seconds_elapsed,z,y,x"
 _WANTED_TEXT = "time,seconds_elapsed,text,millisecond_press_duration"
@@ -38,15 +40,22 @@ ANNOTATION = "Annotation"
 """Table of what the user wrote while the app recorded."""
 PRESS = "millisecond_press_duration"
 _TEXTS = ("text", PRESS)
-"""Columns that stay text, as it is written."""
-_NO_NUMBERS = ("sensor", "name", "standardisation")
+"""Columns that stay text."""
 _NUMBERS = {
     "time", "seconds_elapsed", "x", "y", "z", "latitude", "longitude", "altitude", "horizontalAccuracy",
     "verticalAccuracy", "speed", "bearing", "pressure", "steps", "qw", "qx", "qy", "qz",
 }  # fmt: skip
 """Columns that are read; others may be text, as the times for people that the app writes if told to."""
+_READ_COLUMNS = {*_NUMBERS, *_TEXTS}
 HEAD_BLOCKS = 2
 """Pieces of a table that are read to find out how it is turned: 10 minutes and more at 100 Hz."""
+
+
+PIECE_ROWS = 32_768
+"""Rows of a piece of JSON or of a database."""
+_BETWEEN_OBJECTS = re.compile(rb"\}\s*,\s*(?=\{)")
+END_BYTES, TRIES = 65_536, 3
+"""Where in a piece of JSON its last object is looked for, and how many of its candidates are tried."""
 
 
 class SensorTable(NamedTuple):
@@ -103,9 +112,9 @@ def read_tables(path: Path, report: ReportBuilder) -> tuple[Tables, dict[str, st
         return {k: v for k, v in tables.items() if v is not None}, about
     head = start_of(path)
     if head.startswith(b"SQLite format 3\x00"):
-        return _sqlite(path)
+        return _sqlite(path, report)
     if head.lstrip().startswith(b"["):
-        return _json(path)
+        return _json(path, report)
     table = _csv(path, report)
     name = path.stem if path.stem in READ else ""
     if not name:
@@ -161,73 +170,128 @@ def _csv(file: Path, report: ReportBuilder) -> SensorTable | None:
             for block in float_blocks(file, header, "time", report, integers=("time",), texts=texts):
                 yield block.rename({"time": "t"})
 
+    table = _opened(frames, report)
+    if table is None:
+        report.note("header_only", f"{file.name}: has a header and no row: no channel", subject=file.name)
+    return table
+
+
+def _opened(
+    frames: Callable[[ReportBuilder], Iterator[pl.DataFrame]], report: ReportBuilder
+) -> SensorTable | None:
+    """Return a table with its first rows; None where it has none."""
     # What is found is said when all of it is read; a table without a row is read here.
     first = list(islice(frames(ReportBuilder()), HEAD_BLOCKS)) or list(frames(report))
-    if not first:
-        report.note("header_only", f"{file.name}: has a header and no row: no channel", subject=file.name)
-        return None
-    return SensorTable(pl.concat(first), frames, whole=len(first) < HEAD_BLOCKS)
+    return SensorTable(pl.concat(first), frames, whole=len(first) < HEAD_BLOCKS) if first else None
 
 
-def _numbers(rows: pl.DataFrame) -> pl.DataFrame:
-    """Return a table of text as numbers, but for what people wrote; ``time`` whole."""
-    t = rows["time"].cast(pl.String).cast(pl.Int64, strict=False)
-    others = [c for c in rows.columns if c not in ("time", *_NO_NUMBERS)]
-    table = rows.select(
-        pl.col(c).cast(pl.String)
-        if c in _TEXTS
-        else pl.col(c).cast(pl.String).cast(pl.Float64, strict=False).fill_null(np.nan)
-        for c in others
-    )
-    line = pl.Series("line", np.arange(1, rows.height + 1))
-    return table.with_columns(t=t, line=line)
+def _numbers(
+    rows: Sequence[Sequence[Any]], columns: Sequence[str], line: int, report: ReportBuilder
+) -> pl.DataFrame:
+    """Return cells of any type as numbers, what people wrote as text, ``time`` as ``t``; ``line`` is that of the first."""
+    kinds = {c: _kind(c) for c in columns if c in _READ_COLUMNS}
+    frame = pl.DataFrame([_text(c, [row[k] for row in rows]) for k, c in enumerate(columns) if c in kinds])
+    frame = frame.with_columns(line=pl.int_range(line, line + len(rows), dtype=pl.Int64))
+    return careful_block(frame, {c: c for c in kinds}, kinds, "time", report).rename({"time": "t"})
 
 
-def _json(path: Path) -> tuple[Tables, dict[str, str]]:
+def _kind(column: str) -> type[pl.DataType]:
+    return pl.Int64 if column == "time" else pl.String if column in _TEXTS else pl.Float64
+
+
+def _text(name: str, values: list[Any]) -> pl.Series:
     try:
-        rows = msgspec.json.decode(path.read_bytes(), type=list[dict[str, Any]])
+        return pl.Series(name, values).cast(pl.String)
+    except (TypeError, OverflowError, pl.exceptions.PolarsError):  # of several types
+        return pl.Series(name, [None if v is None else str(v) for v in values], pl.String)
+
+
+def _json(path: Path, report: ReportBuilder) -> tuple[Tables, dict[str, str]]:
+    columns: dict[str, dict[str, None]] = {}
+    about: dict[str, str] = {}
+    for rows in _objects(path, dict[str, Any]):
+        for row in rows:
+            sensor = str(row.get("sensor", ""))
+            if not row.keys() <= columns.setdefault(sensor, {}).keys():
+                columns[sensor] |= dict.fromkeys(row)
+            if sensor == "Metadata":
+                about = about or {k: str(v) for k, v in row.items()}
+
+    def frames(sensor: str, report: ReportBuilder) -> Iterator[pl.DataFrame]:
+        names = [c for c in columns[sensor] if c in _READ_COLUMNS]
+        row_type = msgspec.defstruct("Row", [("sensor", Any, ""), *((c, Any, None) for c in names)], gc=False)
+        cells, line, waiting = attrgetter("sensor", *names), 1, []
+        for rows in chain(_objects(path, row_type), [None]):
+            waiting += [cells(row) for row in rows or () if row.sensor == sensor]
+            if len(waiting) >= PIECE_ROWS or (rows is None and waiting):
+                yield _numbers(waiting, ("sensor", *names), line, report)
+                line += len(waiting)
+                waiting = []
+
+    opened = {s: _opened(partial(frames, s), report) for s in columns if s in READ and "time" in columns[s]}
+    return {s: table for s, table in opened.items() if table is not None}, about
+
+
+def _objects(path: Path, row_type: Any) -> Iterator[list[Any]]:
+    """Yield the objects of a JSON array, some thousand at a time.
+
+    A piece ends where one object does and the next begins; where that is within an object, it is no whole JSON up to
+    there, and more is read.
+    """
+    decoder = msgspec.json.Decoder(list[row_type])  # type: ignore[valid-type]
+    rest, size, start = b"", BLOCK_BYTES, 0
+    try:
+        with path.open("rb") as file:
+            while data := file.read(size):
+                rest += data
+                size = len(rest)
+                ends = list(_BETWEEN_OBJECTS.finditer(rest, max(0, len(rest) - END_BYTES)))
+                for end in ends[: -TRIES - 1 : -1]:
+                    with contextlib.suppress(msgspec.DecodeError):
+                        yield decoder.decode(rest[: end.start() + 1] + b"]")
+                        start += end.end() - 1
+                        rest, size = b"[" + rest[end.end() :], BLOCK_BYTES
+                        break
+            yield decoder.decode(rest)
     except (OSError, msgspec.MsgspecError) as error:
-        raise MarchaError(f"{path}: not a whole JSON of Sensor Logger: {error}") from None
-    by_sensor: dict[str, list[dict[str, Any]]] = {}
-    for row in rows:
-        by_sensor.setdefault(str(row.get("sensor", "")), []).append(row)
-    about = {k: str(v) for k, v in (by_sensor.get("Metadata") or [{}])[0].items()}
-    tables = {k: pl.DataFrame(v, infer_schema_length=None) for k, v in by_sensor.items() if k in READ}
-    return {k: _held(_numbers(v)) for k, v in tables.items() if "time" in v.columns}, about
+        raise MarchaError(f"{path}: not a whole JSON of Sensor Logger behind byte {start}: {error}") from None
 
 
-def _sqlite(path: Path) -> tuple[Tables, dict[str, str]]:
+def _sqlite(path: Path, report: ReportBuilder) -> tuple[Tables, dict[str, str]]:
+    def pieces(query: str) -> Iterator[tuple[list[str], list[Any]]]:
+        uri = f"{path.resolve().as_uri()}?mode=ro"
+        try:
+            with contextlib.closing(sqlite3.connect(uri, uri=True, check_same_thread=False)) as base:
+                cursor = base.execute(query)
+                columns = [c[0] for c in cursor.description]
+                while rows := cursor.fetchmany(PIECE_ROWS):
+                    yield columns, rows
+        except sqlite3.Error as error:
+            raise MarchaError(f"{path}: the database cannot be read: {error}") from None
+
+    def frames(name: str, report: ReportBuilder) -> Iterator[pl.DataFrame]:
+        line = 1
+        for columns, rows in pieces(f'select * from "{name}"'):  # a name of READ: no foreign text
+            if "time" in columns:
+                yield _numbers(rows, columns, line, report)
+            line += len(rows)
+
     tables: Tables = {}
     about: dict[str, str] = {}
-    try:
-        with contextlib.closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as base:
-            names = [r[0] for r in base.execute("select name from sqlite_master where type = 'table'")]
-            for name in names:
-                if name not in READ and name.lower() != "metadata":
-                    continue
-                cursor = base.execute(f'select * from "{name}"')  # a name of READ: no foreign text
-                columns = [c[0] for c in cursor.description]
-                rows = [[None if v is None else str(v) for v in row] for row in cursor]
-                if name.lower() == "metadata":
-                    about = {c: v for c, v in zip(columns, rows[0], strict=True) if v} if rows else {}
-                elif rows and "time" in columns:
-                    data = dict(zip(columns, map(list, zip(*rows, strict=True)), strict=True))
-                    texts = pl.DataFrame(data, schema=dict.fromkeys(columns, pl.String))
-                    tables[name] = _held(_numbers(texts))
-    except sqlite3.Error as error:
-        raise MarchaError(f"{path}: the database cannot be read: {error}") from None
+    names = [
+        name for _, rows in pieces("select name from sqlite_master where type = 'table'") for (name,) in rows
+    ]
+    for name in names:
+        if name.lower() == "metadata":
+            columns, rows = next(pieces(f'select * from "{name}"'), ([], []))
+            about = {c: str(v) for c, v in zip(columns, rows[0], strict=True) if v} if rows else {}
+        elif name in READ and (table := _opened(partial(frames, name), report)) is not None:
+            tables[name] = table
     return tables, about
 
 
 def _held(frame: pl.DataFrame) -> SensorTable:
-    rows = frame.drop_nulls("t")
-
-    def frames(report: ReportBuilder) -> Iterator[pl.DataFrame]:
-        if timeless := frame.height - rows.height:
-            report.drop("bad_row", "time: not a number; row dropped", count=timeless, subject="time")
-        yield rows
-
-    return SensorTable(rows, frames, whole=True)
+    return SensorTable(frame, lambda report: iter([frame]), whole=True)
 
 
 def heads_of(*tables: SensorTable | None) -> list[pl.DataFrame | None]:

@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import ast
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
 import pytest
-from marcha.ingest import cells, optical, orientations, text
+from marcha.ingest import cells, optical, orientations, sensortables, text
+from marcha.ingest.formats.sensor_logger import SensorLogger
 from marcha.ingest.registry import make_options
 from marcha.ingest.simulate import leg, simulate
+from marcha.recording import MarchaError
 from marcha.replay.trajectory import OutOfOrderError, in_order, stances_of, track_of, track_of_stream, way_of
 from scipy.spatial.transform import Rotation
 
-from . import test_import_bids, test_import_leg_contracts, test_import_leg_formats, test_import_phone_apps
+from . import (
+    test_import_bids,
+    test_import_leg_contracts,
+    test_import_leg_formats,
+    test_import_phone,
+    test_import_phone_apps,
+)
 from .conftest import ROOT
 from .contracts.importer import ImporterContract
 
@@ -226,3 +236,24 @@ def test_angles_of_orientations_read_in_windows_are_those_of_the_whole(
     monkeypatch.setattr(orientations, "ROWS", 700)
     monkeypatch.setattr(cells, "BLOCK_BYTES", 3000)
     assert np.abs(knee() - whole).max() < (1e-9 if options else np.radians(1.0))
+
+
+def test_json_of_sensor_logger_is_read_whatever_its_objects_hold(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows: list[dict[str, Any]] = [
+        {"sensor": "Gyroscope", "time": str(k * 10**7), "x": 0.1 * k, "y": k, "z": "1.5", "note": note}
+        for k, note in enumerate(["}, {", [{"a": 1}, {"b": "},{"}], {"c": [{}, {}]}] * 40)
+    ]
+    rows[5]["x"], rows[9]["time"] = "none", "never"
+    path = tmp_path / "log.json"
+    path.write_text(json.dumps(rows))
+    monkeypatch.setattr(sensortables, "BLOCK_BYTES", 100)
+    monkeypatch.setattr(sensortables, "PIECE_ROWS", 50)
+    _, tables, report = test_import_phone.read(SensorLogger(), path)
+    expected = [0.1 * k for k in range(len(rows)) if k not in (5, 9)]
+    assert tables["/phone/gyr"]["gyr_x"].drop_nans().to_list() == expected
+    assert (test_import_phone.kinds(report)["bad_row"], report.rows_dropped) == (1, 1)
+    path.write_text(json.dumps(rows)[:-30])
+    with pytest.raises(MarchaError, match="not a whole JSON"):
+        test_import_phone.read(SensorLogger(), path)

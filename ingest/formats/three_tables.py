@@ -11,7 +11,8 @@ Source: hybrid indoor positioning, chapter 5 (its headers are pictures).
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -27,11 +28,11 @@ from ..floor import kind_of
 from ..headers import (
     TableHeader,
     TimeUnit,
+    cell_windows,
     head_of,
     header_of,
     named_columns,
     numbers,
-    read_cells,
     time_unit,
     times_ns,
 )
@@ -58,6 +59,19 @@ SIGNALS = {
 }
 SENSORS = {"acc": r"acc.*", "mag": r"mag.*", "orientation": r"ori.*", "gyr": r"gyr.*"}
 MICROTESLA = 1e-6
+AXIS_ORDERS = {"x": (0, 1, 2), "z": (2, 0, 1), "y": (1, 0, 2)}
+"""Columns of azimuth, pitch and roll by that of the azimuth."""
+_CHANNELS: dict[str, tuple[str, str, dict[str, str]]] = {
+    "acc": ("/phone/acc", IMU, {"gravity": "included"}),
+    "mag": ("/phone/mag", MAG, {}),
+    "orientation": (
+        "/phone/orientation",
+        QUATERNION,
+        {"north": "magnetic", "source": "azimuth, pitch, roll in degrees"},
+    ),
+    "gyr": ("/phone/gyr", IMU, {}),
+}
+"""Topic, schema and metadata of each sensor."""
 
 
 class ThreeTablesOptions(CommonOptions, frozen=True, kw_only=True):
@@ -153,13 +167,15 @@ class ThreeTables:
         specs = [ChannelSpec(t, s, "phone", metadata=m) for t, (s, m, _) in made.items()]
         return Import(
             channels=specs,
-            blocks=iter([(t, table) for t, (*_, table) in made.items()]),
+            blocks=((t, table) for t, (*_, tables) in made.items() for table in tables),
             report=report,
             metadata=metadata,
         )
 
 
-Made = dict[str, tuple[str, dict[str, str], pl.DataFrame]]
+Made = dict[str, tuple[str, dict[str, str], Iterable[pl.DataFrame]]]
+ROWS = 65_536
+"""Rows of a sensor that are looked at together."""
 
 
 def _read(
@@ -168,7 +184,7 @@ def _read(
     options: ThreeTablesOptions,
     report: ReportBuilder,
 ) -> tuple[Made, str]:
-    """Return schema, metadata and table by topic, and the clock."""
+    """Return schema, metadata and tables by topic, and the clock."""
     made: Made = {}
     unit: TimeUnit | None = None
     for kind, roles, of in (("inertial", INERTIAL, "sensor"), ("radio", SIGNALS, "")):
@@ -176,8 +192,9 @@ def _read(
             continue
         path, header = tables[kind]
         places = header.roles(roles, named)
-        cells = read_cells(path, places, header, report)
-        own = _unit(cells, header.names[places["time"]], path, options, report, of=of) or unit
+        windows = cell_windows(path, places, header, report)
+        first = next(windows)
+        own = _unit(first, header.names[places["time"]], path, options, report, of=of) or unit
         if own is None:
             raise UsageError(f"{path}: nothing says the unit of time; give time_unit=s, ms, us or ns")
         if unit is not None and own.clock != unit.clock:
@@ -186,10 +203,11 @@ def _read(
                 "write both by one clock"
             )
         unit = own
+        timed = (times_ns(cells, own, path, report) for cells in chain([first], windows))
         if kind == "inertial":
-            made |= _inertial(times_ns(cells, unit, path, report), path, options, report)
+            made |= _inertial(timed, path, options, report)
         else:
-            made |= _radio(times_ns(cells, unit, path, report), unit, path, report)
+            made |= _radio(pl.concat(timed), unit, path, report)
     return made, unit.clock if unit is not None else "device"
 
 
@@ -230,94 +248,95 @@ def _unit(
     return time_unit(cells.head(1), name, path, report)
 
 
-def _inertial(cells: pl.DataFrame, path: Path, options: ThreeTablesOptions, report: ReportBuilder) -> Made:
-    cells = numbers(cells, ("x", "y", "z"), path, report)
-    word = cells["sensor"].str.to_lowercase()
-    kinds = pl.select(
-        pl.coalesce(pl.when(word.str.contains(p)).then(pl.lit(k)) for k, p in SENSORS.items())
-    ).to_series()
-    unread = kinds.is_null()
-    if unread.any():
-        first = int(unread.arg_true()[0])
-        report.drop(
-            "unused_row",
-            f"{path.name}: sensor {cells['sensor'][first]!r} is not imported",
-            count=int(unread.sum()),
-            line=cells["line"][first],
-            subject=f"{path.name} sensor",
-        )
+def _inertial(
+    windows: Iterable[pl.DataFrame], path: Path, options: ThreeTablesOptions, report: ReportBuilder
+) -> Made:
+    parts: dict[str, list[pl.DataFrame]] = {kind: [] for kind in SENSORS}
+    for window in windows:
+        cells = numbers(window, ("x", "y", "z"), path, report)
+        word = cells["sensor"].str.to_lowercase()
+        kinds = pl.select(
+            pl.coalesce(pl.when(word.str.contains(p)).then(pl.lit(k)) for k, p in SENSORS.items())
+        ).to_series()
+        unread = kinds.is_null()
+        if unread.any():
+            first = int(unread.arg_true()[0])
+            report.drop(
+                "unused_row",
+                f"{path.name}: sensor {cells['sensor'][first]!r} is not imported",
+                count=int(unread.sum()),
+                line=cells["line"][first],
+                subject=f"{path.name} sensor",
+            )
+        for kind, held in parts.items():
+            own = cells.filter(kinds == kind).drop("sensor")
+            held.append(own.filter(pl.all_horizontal(pl.col("x", "y", "z").is_finite())))
+            report.drop(
+                "bad_row",
+                f"{path.name} {kind}: a value is missing: row dropped",
+                count=own.height - held[-1].height,
+                subject=f"{path.name} {kind}",
+            )
     made: Made = {}
     for kind in SENSORS:
-        part = cells.filter(kinds == kind)
-        part = part.filter(pl.all_horizontal(pl.col("x", "y", "z").is_finite()))
+        part = pl.concat(parts.pop(kind))
         if part.is_empty():
             continue
-        report.drop(
-            "bad_row",
-            f"{path.name} {kind}: a value is missing: row dropped",
-            count=int((kinds == kind).sum()) - part.height,
-            subject=f"{path.name} {kind}",
-        )
         part = ordered(part, f"{path.name} {kind}", report)
         report.keep(part.height)
-        topic, schema, about, table = _sensor(kind, part, path, options, report)
-        made[topic] = schema, about, table
+        topic, schema, about = _CHANNELS[kind]
+        order = _order(part, path, options, report) if kind == "orientation" else AXIS_ORDERS["x"]
+        made[topic] = schema, about, _tables(kind, part, order, report)
     return made
 
 
-def _sensor(
-    kind: str, part: pl.DataFrame, path: Path, options: ThreeTablesOptions, report: ReportBuilder
-) -> tuple[str, str, dict[str, str], pl.DataFrame]:
-    """Return topic, schema, metadata and table of one sensor."""
-    xyz = part.select("x", "y", "z").to_numpy()
-    lines = part["line"].to_numpy().astype(np.int64)
-    t = part.select("t_ns")
-    if kind in ("acc", "gyr"):
-        names = ACC if kind == "acc" else GYR
-        check = SensorCheck(report, f"/phone/{kind}", names)
-        check.feed(list(xyz.T), lines)
-        columns = [np.ascontiguousarray(c) for c in xyz.T]
-        check.feed_si(columns if kind == "acc" else (), columns if kind == "gyr" else (), lines)
+def _tables(
+    kind: str, part: pl.DataFrame, order: Sequence[int], report: ReportBuilder
+) -> Iterator[pl.DataFrame]:
+    """Yield the tables of one sensor, its readings checked."""
+    topic = _CHANNELS[kind][0]
+    names = {"acc": ACC, "gyr": GYR, "mag": FIELD}.get(kind, ())
+    check = SensorCheck(report, topic, names) if kind in ("acc", "gyr") else None
+    for rows in part.iter_slices(ROWS):
+        xyz = rows.select("x", "y", "z").to_numpy()
+        lines = rows["line"].to_numpy().astype(np.int64)
+        t = rows.select("t_ns")
+        if kind == "orientation":
+            azimuth, pitch, roll = (np.radians(xyz[:, k]) for k in order)
+            yield t.with_columns(pl.Series(k, v) for k, v in quaternion_of(azimuth, pitch, roll).items())
+            continue
+        if check is not None:
+            columns = [np.ascontiguousarray(c) for c in xyz.T]
+            check.feed(list(xyz.T), lines)
+            check.feed_si(columns if kind == "acc" else (), columns if kind == "gyr" else (), lines)
+        else:
+            xyz = xyz * MICROTESLA
+            check_plausible(report, topic, {c: xyz[:, i] for i, c in enumerate(names)}, lines)
+        yield t.with_columns(pl.Series(c, xyz[:, i]) for i, c in enumerate(names))
+    if check is not None:
         check.finish()
-        about = {"gravity": "included"} if kind == "acc" else {}
-        return (
-            f"/phone/{kind}",
-            IMU,
-            about,
-            t.with_columns(pl.Series(n, c) for n, c in zip(names, columns, strict=True)),
-        )
-    if kind == "mag":
-        field = xyz * MICROTESLA
-        check_plausible(report, "/phone/mag", {c: field[:, i] for i, c in enumerate(FIELD)}, lines)
-        return "/phone/mag", MAG, {}, t.with_columns(pl.Series(c, field[:, i]) for i, c in enumerate(FIELD))
-    azimuth, pitch, roll = _angles(xyz, path, options, report)
-    table = t.with_columns(pl.Series(k, v) for k, v in quaternion_of(azimuth, pitch, roll).items())
-    about = {"north": "magnetic", "source": "azimuth, pitch, roll in degrees"}
-    return "/phone/orientation", QUATERNION, about, table
 
 
-def _angles(
-    degrees: np.ndarray, path: Path, options: ThreeTablesOptions, report: ReportBuilder
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return azimuth, pitch, roll (rad): the column that runs over 0 to 360 is the azimuth.
+def _order(
+    part: pl.DataFrame, path: Path, options: ThreeTablesOptions, report: ReportBuilder
+) -> Sequence[int]:
+    """Return the columns of azimuth, pitch, roll: the one that runs over 0 to 360 is the azimuth.
 
     Android gives azimuth, pitch, roll; the source's text names them by axis: x pitch, y roll, z azimuth.
     """
-    orders = {"x": (0, 1, 2), "z": (2, 0, 1), "y": (1, 0, 2)}
-    wide = [a for k, a in enumerate("xyz") if degrees[:, k].max() > 180.0 and degrees[:, k].min() >= 0.0]
     if options.azimuth is not None:
-        chosen = options.azimuth
-    elif len(wide) == 1:
-        chosen = wide[0]
-    else:
-        chosen = "x"
-        report.note(
-            "axis_doubt",
-            f"{path.name} orientation: no single column runs over 0 to 360, so none is surely the azimuth: Android's "
-            "order azimuth, pitch, roll is taken; give azimuth=x, y or z where it is another",
-        )
-    azimuth, pitch, roll = (np.radians(degrees[:, k]) for k in orders[chosen])
-    return azimuth, pitch, roll
+        return AXIS_ORDERS[options.azimuth]
+    wide = part.select((pl.col("x", "y", "z").max() > 180.0) & (pl.col("x", "y", "z").min() >= 0.0)).row(
+        0, named=True
+    )
+    if sum(wide.values()) == 1:
+        return AXIS_ORDERS[next(a for a, runs in wide.items() if runs)]
+    report.note(
+        "axis_doubt",
+        f"{path.name} orientation: no single column runs over 0 to 360, so none is surely the azimuth: Android's "
+        "order azimuth, pitch, roll is taken; give azimuth=x, y or z where it is another",
+    )
+    return AXIS_ORDERS["x"]
 
 
 def _radio(cells: pl.DataFrame, unit: TimeUnit, path: Path, report: ReportBuilder) -> Made:
@@ -360,7 +379,7 @@ def _radio(cells: pl.DataFrame, unit: TimeUnit, path: Path, report: ReportBuilde
             pl.when(pl.col("frequency") < 1e5).then(pl.col("frequency") * 1e6).otherwise(pl.col("frequency"))
         )
         table = table.with_columns(cells.select(frequency_hz=hertz))
-    return {"/phone/radio": (RADIO, {}, table)}
+    return {"/phone/radio": (RADIO, {}, [table])}
 
 
 def _seen(cells: pl.DataFrame, unit: TimeUnit) -> pl.Series:
