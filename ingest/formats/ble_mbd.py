@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -23,11 +23,14 @@ import polars as pl
 from ...recording.errors import MarchaError, UsageError
 from ..contract import ChannelSpec, CommonOptions, Import, ReportBuilder
 from ..radio import RADIO, REFERENCE, address, anchor_table, ordered, read_text, survey
+from ..text import text_lines
 
 POSE = "geometry_msgs/msg/PoseStamped"
 _ROW = re.compile(rb"^\d{9,10}(\.\d+)?,[0-9a-fA-F]{12},[0-9a-fA-F]{12},-?\d+")
 _PLACE = re.compile(r"^(?P<receiver>[^_]+)_(?P<x>-?\d+(\.\d+)?)_(?P<y>-?\d+(\.\d+)?)_(?P<z>-?\d+(\.\d+)?)$")
 QUAT = ("quat_w", "quat_x", "quat_y", "quat_z")
+ROWS = 65_536
+"""Rows whose poses are made together."""
 
 
 class MbdOptions(CommonOptions, frozen=True, kw_only=True):
@@ -76,22 +79,23 @@ class BleMbd:
             raise UsageError(
                 f"{files[0]}: tracks and calibration files do not go into one recording; convert each"
             )
-        tables: dict[str, pl.DataFrame] = {}
+        tables: dict[str, Iterable[pl.DataFrame]] = {}
         if static[0]:
             stretches = [(f, p) for f, p in zip(files, parts, strict=True) if p.height]
             points = [(p["t_ns"].min(), p["t_ns"].max(), _place(f, devices, p)) for f, p in stretches]
             points, parts = _apart(stretches, points, report)
-            tables[REFERENCE.topic] = survey(points)
+            tables[REFERENCE.topic] = [survey(points)]
         elif len(files) > 1:
             raise UsageError(f"{files[0]}: {len(files)} tracks; convert them one by one")
         whole = ordered(pl.concat(parts), files[0].name, report)
+        del parts
         report.keep(whole.height)
         beacons = sorted(whole["beacon"].unique().to_list())
         specs: list[ChannelSpec] = []
         for k, beacon in enumerate(beacons):
-            mine = whole.filter(pl.col("beacon") == beacon)
+            mine = whole if len(beacons) == 1 else whole.filter(pl.col("beacon") == beacon)
             topic = "/indoor/radio" if len(beacons) == 1 else f"/indoor/beacon{k + 1}/radio"
-            tables[topic] = mine.select("t_ns", "mac", "rssi_dbm", technology=pl.lit("ble"))
+            tables[topic] = [mine.select("t_ns", "mac", "rssi_dbm", technology=pl.lit("ble"))]
             specs.append(ChannelSpec(topic, RADIO, "plan", metadata={"beacon": beacon, "mac": "receiver"}))
             if not static[0]:
                 reference = "/reference/pose" if len(beacons) == 1 else f"/reference/beacon{k + 1}/pose"
@@ -101,7 +105,7 @@ class BleMbd:
             specs.append(REFERENCE)
         return Import(
             channels=specs,
-            blocks=iter(tables.items()),
+            blocks=((topic, table) for topic, parts in tables.items() for table in parts),
             report=report,
             metadata={
                 "device": {
@@ -123,16 +127,20 @@ class BleMbd:
 
 def _parse(path: Path, report: ReportBuilder) -> pl.DataFrame:
     """Return t_ns, mac, beacon, rssi_dbm and, on a track, x y z r00 … r22."""
-    good: list[list[str]] = []
+    parts: list[pl.DataFrame] = []
     width = 0
-    text = read_text(path)
-    for line, row in enumerate(text.splitlines(), start=1):
-        if not row.strip():
-            continue
-        cells = row.split(",")
-        if not width and len(cells) in (4, 16) and _ROW.match(row.encode()):
-            width = len(cells)
-        if len(cells) != width or not _ROW.match(row.encode()) or not _numbers(cells[3:]):
+    for first, lines in text_lines(path):
+        good: list[list[str]] = []
+        for line, row in enumerate(lines, first):
+            if not row.strip():
+                continue
+            cells = row.split(",")
+            matches = _ROW.match(row.encode()) is not None
+            if not width and len(cells) in (4, 16) and matches:
+                width = len(cells)
+            if len(cells) == width and matches and _numbers(cells[3:]):
+                good.append(cells)
+                continue
             if not width:
                 raise MarchaError(
                     f"{path}, line {line}: not epoch_s,receiver,beacon,rssi[,x,y,z,R]: {row[:30]!r}"
@@ -140,23 +148,26 @@ def _parse(path: Path, report: ReportBuilder) -> pl.DataFrame:
             report.drop(
                 "bad_row", f"{path.name}: {row[:40]!r}: not a row of {width} cells; dropped", line=line
             )
-            continue
-        good.append(cells)
-    if not good:
+        if good:
+            parts.append(_table(good))
+    if not parts:
         raise MarchaError(f"{path}: no row epoch_s,receiver,beacon,rssi; nothing to convert")
+    return pl.concat(parts)
+
+
+def _table(rows: Sequence[Sequence[str]]) -> pl.DataFrame:
     # Whole and fractional seconds apart: an epoch in nanoseconds does not fit a float.
-    whole = [c[0].partition(".") for c in good]
-    t = [int(s) * 1_000_000_000 + int((f + "0" * 9)[:9]) for s, _, f in whole]
+    whole = [c[0].partition(".") for c in rows]
     columns: dict[str, Any] = {
-        "t_ns": pl.Series(t, dtype=pl.Int64),
-        "mac": [address(c[1]) for c in good],
-        "beacon": [address(c[2]) for c in good],
-        "rssi_dbm": pl.Series([float(c[3]) for c in good], dtype=pl.Float64),
+        "t_ns": [int(s) * 1_000_000_000 + int((f + "0" * 9)[:9]) for s, _, f in whole],
+        "mac": [address(c[1]) for c in rows],
+        "beacon": [address(c[2]) for c in rows],
     }
-    if width == 16:
-        values = np.array([c[4:] for c in good], dtype=np.float64)
-        columns |= {f"v{i}": values[:, i] for i in range(12)}
-    return pl.DataFrame(columns)
+    values = np.array([c[3:] for c in rows], dtype=np.float64)
+    names = ("rssi_dbm", *(f"v{i}" for i in range(values.shape[1] - 1)))
+    return pl.DataFrame(
+        columns | {n: values[:, i] for i, n in enumerate(names)}, schema_overrides={"t_ns": pl.Int64}
+    )
 
 
 def _numbers(cells: Sequence[str]) -> bool:
@@ -166,25 +177,25 @@ def _numbers(cells: Sequence[str]) -> bool:
         return False
 
 
-def _poses(track: pl.DataFrame, report: ReportBuilder) -> pl.DataFrame:
-    """Return the optical poses; a matrix is projected to the nearest rotation."""
+def _poses(track: pl.DataFrame, report: ReportBuilder) -> Iterator[pl.DataFrame]:
+    """Yield the optical poses; a matrix is projected to the nearest rotation."""
     from scipy.spatial.transform import Rotation
 
-    first = track.unique("t_ns", keep="first", maintain_order=True)
-    matrices = first.select(f"v{i}" for i in range(3, 12)).to_numpy().reshape(-1, 3, 3)
-    u, s, vt = np.linalg.svd(matrices)
-    flip = np.ones((len(u), 3))
-    flip[:, 2] = np.sign(np.linalg.det(u @ vt))
-    rotations = (u * flip[:, None, :]) @ vt
-    rough = np.abs(s - 1).max(axis=1) > 0.05
-    if rough.any():
-        report.note(
-            "rough_rotation", "rotation matrices off orthogonal by more than 5 %", count=int(rough.sum())
+    for first in track.unique("t_ns", keep="first", maintain_order=True).iter_slices(ROWS):
+        matrices = first.select(f"v{i}" for i in range(3, 12)).to_numpy().reshape(-1, 3, 3)
+        u, s, vt = np.linalg.svd(matrices)
+        flip = np.ones((len(u), 3))
+        flip[:, 2] = np.sign(np.linalg.det(u @ vt))
+        rotations = (u * flip[:, None, :]) @ vt
+        rough = np.abs(s - 1).max(axis=1) > 0.05
+        if rough.any():
+            report.note(
+                "rough_rotation", "rotation matrices off orthogonal by more than 5 %", count=int(rough.sum())
+            )
+        xyzw = Rotation.from_matrix(rotations).as_quat()
+        yield first.select("t_ns", pos_x="v0", pos_y="v1", pos_z="v2").with_columns(
+            **{n: pl.Series(xyzw[:, i]) for n, i in zip(QUAT, (3, 0, 1, 2), strict=True)}
         )
-    xyzw = Rotation.from_matrix(rotations).as_quat()
-    return first.select("t_ns", pos_x="v0", pos_y="v1", pos_z="v2").with_columns(
-        **{n: pl.Series(xyzw[:, i]) for n, i in zip(QUAT, (3, 0, 1, 2), strict=True)}
-    )
 
 
 def _place(
