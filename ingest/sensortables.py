@@ -188,7 +188,7 @@ def _opened(
 def _numbers(
     rows: Sequence[Sequence[Any]], columns: Sequence[str], line: int, report: ReportBuilder
 ) -> pl.DataFrame:
-    """Return cells of any type as numbers, what people wrote as text, ``time`` as ``t``; ``line`` is that of the first."""
+    """Return cells of any type as numbers, what people wrote as text, ``time`` as ``t``; ``line``: the first."""
     kinds = {c: _kind(c) for c in columns if c in _READ_COLUMNS}
     frame = pl.DataFrame([_text(c, [row[k] for row in rows]) for k, c in enumerate(columns) if c in kinds])
     frame = frame.with_columns(line=pl.int_range(line, line + len(rows), dtype=pl.Int64))
