@@ -19,7 +19,7 @@ from ..recording.errors import MarchaError, UsageError
 from .anchors import DEGREES_SPAN, GeographicLayout, is_anchor_header, layout_of, read_anchors
 from .contract import ReportBuilder, SourceAttachment
 from .headers import header_of
-from .text import start_of
+from .text import BOM, start_of
 
 PLACE_KEYS = ("width_m", "height_m", "metres_per_pixel", "x_m", "y_m", "x_axis_azimuth_deg", "storey_m")
 KINDS = ("wall", "obstacle", "passable", "room", "zone", "stairs")
@@ -56,7 +56,7 @@ def kind_of(path: Path) -> str:
     head = start_of(path, 65536)
     if any(head.startswith(magic) for magic in PICTURES) or path.suffix.lower() in OTHER_PICTURES:
         return "picture"
-    if head.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
+    if head.removeprefix(BOM).lstrip().startswith(b"{"):
         if b'"FeatureCollection"' in head:
             return "outline"
         return "place" if b"map_info" in head or any(f'"{k}"'.encode() in head for k in PLACE_KEYS) else ""

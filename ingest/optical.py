@@ -29,26 +29,6 @@ ANGLES_TOPIC = "/reference/optical/joint"
 """Angles made of markers; what a file itself says of angles is ``/reference/joint``."""
 
 
-def read_text(path: Path) -> str:
-    """Return a text file, line ends as LF.
-
-    Raises
-    ------
-    MarchaError
-        It cannot be read.
-    """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise MarchaError(f"{path}: cannot be read: {error.strerror or error}") from error
-    return (
-        data.removeprefix(b"\xef\xbb\xbf")
-        .decode("utf-8", "replace")
-        .replace("\r\n", "\n")
-        .replace("\r", "\n")
-    )
-
-
 def float_windows(
     path: Path,
     pieces: Iterable[tuple[int, Sequence[str]]],
@@ -297,11 +277,25 @@ def marker_import(
     )
 
 
+def _roles(landmarks: str) -> dict[str, str]:
+    """Return the landmark of each marker that the option names."""
+    roles = {}
+    for pair in filter(None, landmarks.replace(" ", "").split(",")):
+        marker, colon, role = pair.partition(":")
+        if not colon:
+            raise UsageError(
+                f"option landmarks: {pair!r} is no MARKER:LANDMARK pair, such as RLE:right_knee_lat"
+            )
+        roles[marker] = role
+    return roles
+
+
 class _Reference:
     """What markers say of joints and segments, window by window: the first says what is constant in the capture."""
 
     def __init__(self, names: Sequence[str], options: MarkerOptions, report: ReportBuilder) -> None:
         self._names, self._options, self._report = names, options, report
+        self._roles = {} if options.angles == "off" else _roles(options.landmarks or "")
         self._constants: dict[Any, Any] = {}
         self._rows = self._hidden = 0
         self._first_hidden: tuple[int, int] | None = None
@@ -331,18 +325,9 @@ class _Reference:
         return reference_channels(angles)
 
     def _angles(self, t_ns: NDArray[np.int64], seen: FloatArray) -> ReferenceAngles:
-        roles = {}
-        for pair in (self._options.landmarks or "").replace(" ", "").split(","):
-            marker, colon, role = pair.partition(":")
-            if pair and not colon:
-                raise UsageError(
-                    f"option landmarks: {pair!r} is no MARKER:LANDMARK pair, such as RLE:right_knee_lat"
-                )
-            if pair:
-                roles[marker] = role
         t, how = t_ns.astype(np.float64) * 1e-9, self._options.angles
         try:
-            angles = from_markers(t, self._names, seen, how, roles, self._constants)
+            angles = from_markers(t, self._names, seen, how, self._roles, self._constants)
         except ValueError as error:
             raise UsageError(f"option landmarks: {error}") from None
         if self._options.side is None:
@@ -367,11 +352,11 @@ class _Reference:
                 line=row + 1,
                 subject="hidden",
             )
-        for name, loss in self._remarks.items():
+        for name, remark in self._remarks.items():
             share = 100.0 * (self._lost[name] / self._rows)
             self._report.note(
                 "reference_angle",
-                f"{ANGLES_TOPIC} {name}: {loss}; {share:.2g} % of the frames without",
+                f"{ANGLES_TOPIC} {name}: {remark}; {share:.2g} % of the frames without",
                 subject=name,
             )
 
@@ -391,11 +376,7 @@ def reference_channels(angles: ReferenceAngles) -> list[tuple[ChannelSpec, pl.Da
         if good.any():
             quat[good] = Rotation.from_matrix(rot[good]).as_quat(canonical=True, scalar_first=True)
         table = pl.DataFrame({c: quat[:, k] for k, c in enumerate(QUAT)})
-        loss = {"frame": "x right, y forward, z up along the segment, from landmarks (docs/joints.md)"}
-        channels.append(
-            (
-                ChannelSpec(f"/reference/optical/{segment}/orientation", ORIENTATION, "optical", QUAT, loss),
-                table,
-            )
-        )
+        axes = {"frame": "x right, y forward, z up along the segment, from landmarks (docs/joints.md)"}
+        topic = f"/reference/optical/{segment}/orientation"
+        channels.append((ChannelSpec(topic, ORIENTATION, "optical", QUAT, axes), table))
     return channels

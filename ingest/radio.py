@@ -7,7 +7,6 @@ import io
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -15,7 +14,6 @@ import numpy as np
 import polars as pl
 
 from .contract import ChannelSpec, Report, ReportBuilder, SourceAttachment
-from .text import read_whole
 
 RADIO = "marcha_msgs/msg/RadioSignal"
 POINT = "geometry_msgs/msg/PointStamped"
@@ -215,11 +213,6 @@ def ordered(table: pl.DataFrame, label: str, report: ReportBuilder) -> pl.DataFr
         line=line,
     )
     return table.sort("t_ns", maintain_order=True)
-
-
-def read_text(path: Path) -> str:
-    """Return a text file; MarchaError names it where it cannot be read."""
-    return read_whole(path).decode("utf-8-sig", "replace")
 
 
 def survey(points: Sequence[tuple[int, int, Sequence[float]]]) -> pl.DataFrame:

@@ -158,7 +158,8 @@ def _annotations(file: Path, report: ReportBuilder) -> SensorTable | None:
     frame = careful_block(
         pl.DataFrame({"line": lines, **cells}), {n: n for n in kinds}, kinds, "time", report
     )
-    return _held(frame.rename({"time": "t"}))
+    frame = frame.rename({"time": "t"})
+    return SensorTable(frame, lambda report: iter([frame]), whole=True)
 
 
 def _csv(file: Path, report: ReportBuilder) -> SensorTable | None:
@@ -228,6 +229,7 @@ def _json(path: Path, report: ReportBuilder) -> tuple[Tables, dict[str, str]]:
                 line += len(waiting)
                 waiting = []
 
+    note_unread([s for s in columns if s not in (*READ, "Metadata")], report)
     opened = {s: _opened(partial(frames, s), report) for s in columns if s in READ and "time" in columns[s]}
     return {s: table for s, table in opened.items() if table is not None}, about
 
@@ -278,20 +280,19 @@ def _sqlite(path: Path, report: ReportBuilder) -> tuple[Tables, dict[str, str]]:
 
     tables: Tables = {}
     about: dict[str, str] = {}
-    names = [
-        name for _, rows in pieces("select name from sqlite_master where type = 'table'") for (name,) in rows
-    ]
+    unread: list[str] = []
+    listing = "select name from sqlite_master where type = 'table' and name not like 'sqlite_%'"
+    names = [name for _, rows in pieces(listing) for (name,) in rows]
     for name in names:
         if name.lower() == "metadata":
             columns, rows = next(pieces(f'select * from "{name}"'), ([], []))
             about = {c: str(v) for c, v in zip(columns, rows[0], strict=True) if v} if rows else {}
-        elif name in READ and (table := _opened(partial(frames, name), report)) is not None:
+        elif name not in READ:
+            unread.append(name)
+        elif (table := _opened(partial(frames, name), report)) is not None:
             tables[name] = table
+    note_unread(unread, report)
     return tables, about
-
-
-def _held(frame: pl.DataFrame) -> SensorTable:
-    return SensorTable(frame, lambda report: iter([frame]), whole=True)
 
 
 def heads_of(*tables: SensorTable | None) -> list[pl.DataFrame | None]:

@@ -64,6 +64,11 @@ def read_whole(path: Path) -> bytes:
     return start_of(path, -1)
 
 
+def read_text(path: Path) -> str:
+    """Return a text file (UTF-8, with or without a byte order mark), line ends as LF; raises as :func:`start_of`."""
+    return read_whole(path).decode("utf-8-sig", "replace").replace("\r\n", "\n").replace("\r", "\n")
+
+
 def read_blocks(path: Path, size: int | None = BLOCK_BYTES) -> Iterator[tuple[bytes, bool]]:
     """Yield pieces of a file cut at line ends, and whether a piece is the last.
 

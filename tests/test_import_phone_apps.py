@@ -177,6 +177,7 @@ def test_sensor_logger_without_metadata_is_turned_by_the_field(
 @pytest.mark.parametrize("kind", ["json", "sqlite", "zip"])
 def test_sensor_logger_in_one_file_is_the_same(tmp_path: Path, walk: PhoneWalk, kind: str) -> None:
     folder = samples.sensor_logger(tmp_path / "log", walk, "ios")
+    (folder / "Light.csv").write_text("time,seconds_elapsed,lux\n1,0.0,3\n")
     tables = {f.stem: list(csv.DictReader(f.open())) for f in folder.glob("*.csv")}
     path = tmp_path / f"log.{kind}"
     if kind == "json":
@@ -195,6 +196,8 @@ def test_sensor_logger_in_one_file_is_the_same(tmp_path: Path, walk: PhoneWalk, 
     whole, single = convert(folder, tmp_path / "a.mcap"), convert(path, tmp_path / "b.mcap")
     assert whole.format == single.format == "sensor-logger"
     assert whole.channels == single.channels
+    unread = [f.detail for done in (whole, single) for f in done.report.findings if f.kind == "unused_file"]
+    assert [text.removesuffix(": not imported").removesuffix(".csv") for text in unread] == ["Light", "Light"]
     first, second = (mr.open(tmp_path / name).annotations for name in ("a.mcap", "b.mcap"))
     assert first.height == 2
     assert first.equals(second)

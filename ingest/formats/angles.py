@@ -56,7 +56,7 @@ class Angles:
 
     def sniff(self, head: bytes, path: Path) -> float:
         """OpenSim's header, or a time and columns that all say deg or rad."""
-        text = head.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "replace")
+        text = head.decode("utf-8-sig", "replace")
         lines = [x.rstrip() for x in text.replace("\r", "\n").split("\n")]
         facts, end = _facts(lines)
         if end is not None:

@@ -22,8 +22,8 @@ from ...recording.event_table import read_events
 from ...recording.events import bids_events
 from ...recording.files import read_small
 from ..contract import ChannelSpec, CommonOptions, Import, ReportBuilder
-from ..optical import TimedTables, blocks_of, float_windows, read_text
-from ..text import text_lines
+from ..optical import TimedTables, blocks_of, float_windows
+from ..text import read_text, text_lines
 from ..timestamps import nanoseconds, possible_rate
 from ..units import conversion
 

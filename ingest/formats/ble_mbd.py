@@ -21,14 +21,14 @@ import numpy as np
 import polars as pl
 
 from ...recording.errors import MarchaError, UsageError
+from ...recording.rotations import QUAT
 from ..contract import ChannelSpec, CommonOptions, Import, ReportBuilder
-from ..radio import RADIO, REFERENCE, address, anchor_table, ordered, read_text, survey
-from ..text import text_lines
+from ..radio import RADIO, REFERENCE, address, anchor_table, ordered, survey
+from ..text import BOM, read_text, text_lines
 
 POSE = "geometry_msgs/msg/PoseStamped"
 _ROW = re.compile(rb"^\d{9,10}(\.\d+)?,[0-9a-fA-F]{12},[0-9a-fA-F]{12},-?\d+")
 _PLACE = re.compile(r"^(?P<receiver>[^_]+)_(?P<x>-?\d+(\.\d+)?)_(?P<y>-?\d+(\.\d+)?)_(?P<z>-?\d+(\.\d+)?)$")
-QUAT = ("quat_w", "quat_x", "quat_y", "quat_z")
 ROWS = 65_536
 """Rows whose poses are made together."""
 
@@ -63,7 +63,7 @@ class BleMbd:
         if path.is_dir():
             files = list(path.glob("*.mbd"))
             return 0.9 if files and all(_PLACE.match(f.stem) for f in files) else 0.0
-        return 0.95 if _ROW.match(head.removeprefix(b"\xef\xbb\xbf")) else 0.0
+        return 0.95 if _ROW.match(head.removeprefix(BOM)) else 0.0
 
     def read(self, paths: Sequence[Path], options: MbdOptions) -> Import:
         """Read one track, or calibration files together."""

@@ -19,8 +19,9 @@ import polars as pl
 
 from ...recording.errors import MarchaError, UsageError
 from ..contract import CommonOptions, Import, ReportBuilder
-from ..radio import compare_powers, local_address, read_text, signed_powers, technology_of
+from ..radio import compare_powers, local_address, signed_powers, technology_of
 from ..surveys import SurveyPoint, survey_import
+from ..text import read_text
 from ..workbook import is_workbook, read_workbook
 
 _ROW = re.compile(r"^\s*(?:Node\s+)?(?P<node>\w+)\s*:\s*(?P<rssi>-?\d+(?:\.\d+)?)\s*$")

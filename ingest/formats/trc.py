@@ -14,7 +14,7 @@ from ...recording.errors import MarchaError, UsageError
 from ..contract import Import, ReportBuilder
 from ..leg import unique_markers
 from ..optical import MarkerOptions, float_windows, marker_import, marker_table
-from ..text import text_lines
+from ..text import BOM, text_lines
 from ..timestamps import nanoseconds
 from ..units import conversion
 
@@ -41,7 +41,7 @@ class Trc:
 
     def sniff(self, head: bytes, path: Path) -> float:
         """Its first word."""
-        return 1.0 if head.removeprefix(b"\xef\xbb\xbf").startswith(b"PathFileType") else 0.0
+        return 1.0 if head.removeprefix(BOM).startswith(b"PathFileType") else 0.0
 
     def read(self, paths: Sequence[Path], options: TrcOptions) -> Import:
         """Read one file."""

@@ -79,7 +79,7 @@ class ViconCsv:
         """A section's name, a rate and a header of frames."""
         if b"Sub Frame" not in head:
             return 0.0
-        lines = head[:65536].removeprefix(b"\xef\xbb\xbf").decode("utf-8", "replace").splitlines()
+        lines = head[:65536].decode("utf-8-sig", "replace").splitlines()
         begins = any(_starts(lines, k) for k in range(len(lines) - 3))
         return 0.95 if begins else 0.0
 
