@@ -82,6 +82,22 @@ def kinds(made: object) -> set[str]:
     return {f.kind for f in made.report.findings}  # pyright: ignore[reportAttributeAccessIssue]
 
 
+@pytest.mark.parametrize(
+    ("name", "head"),
+    [
+        (
+            "a.trc",
+            "PathFileType\t4\t(X/Y/Z)\ta.trc\nDataRate\tUnits\n100\tmm\nFrame#\tTime\thip\n\t\tX1\tY1\tZ1\n",
+        ),
+        ("a.sto", "DataType=Quaternion\nversion=3\nendheader\ntime\tpelvis_imu\n"),
+    ],
+)
+def test_a_capture_without_a_row_is_said(tmp_path: Path, name: str, head: str) -> None:
+    (tmp_path / name).write_text(head)
+    with pytest.raises(MarchaError, match="no row"):
+        convert(tmp_path / name, tmp_path / "r.mcap")
+
+
 def test_a_capture_and_its_markers_are_one_recording_on_two_clocks(tmp_path: Path) -> None:
     made = simulate("walking", tmp_path, seed=2, duration_s=20, optical_offset_s=1.5, noise="mems")
     done = convert(made.paths, tmp_path / "r.mcap")

@@ -169,7 +169,7 @@ def _orientations(
 
     def tables() -> Iterator[TimedTables]:
         for values, rows in windows:
-            quats = values[:, 1:].reshape(len(values), -1, 4)
+            quats = values[:, 1:].reshape(len(values), len(names), 4)
             if turn:  # +90° about x, then it
                 w, x, y, z = np.moveaxis(quats, 2, 0)
                 quats = np.sqrt(0.5) * np.stack((w - x, x + w, y - z, z + y), axis=2)

@@ -84,7 +84,7 @@ class Trc:
                     )
                     values, rows = values[~timeless], rows[~timeless]
                 kept += len(values)
-                pos = values[:, 2:].reshape(len(values), -1, 3) * factor
+                pos = values[:, 2:].reshape(len(values), len(names), 3) * factor
                 if options.y_up:
                     pos = pos[..., [0, 2, 1]] * np.array([1.0, -1.0, 1.0])
                 times = pl.DataFrame({"t": nanoseconds(values[:, 1], 1e9), "line": rows})
