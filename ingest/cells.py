@@ -29,6 +29,8 @@ class Cells:
         The file.
     layout : TextLayout
         How it is laid out.
+    size : int
+        Bytes of a block.
 
     Raises
     ------
@@ -38,8 +40,9 @@ class Cells:
         It cannot be read.
     """
 
-    def __init__(self, path: Path, layout: TextLayout) -> None:
+    def __init__(self, path: Path, layout: TextLayout, size: int = BLOCK_BYTES) -> None:
         self.path = path
+        self._size = size
         self._layout = layout
         self._separator = b"\t" if layout.separator == "blanks" else layout.separator.encode("ascii")
         self._preamble = layout.skip_rows + layout.header + layout.skip_after_header
@@ -86,7 +89,7 @@ class Cells:
     def _blocks(self) -> Iterator[tuple[bytes, int]]:
         """Yield blocks with LF line ends and one-byte separators, and their number of physical lines."""
         wide = self._layout.encoding.lower().replace("_", "-").startswith(("utf-16", "utf-32"))
-        for k, (piece, _) in enumerate(read_blocks(self.path, None if wide else BLOCK_BYTES)):
+        for k, (piece, _) in enumerate(read_blocks(self.path, None if wide else self._size)):
             if not piece and k:
                 continue
             if self._layout.encoding.lower() not in ("utf-8", "ascii"):

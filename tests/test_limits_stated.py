@@ -234,7 +234,7 @@ def test_angles_of_orientations_read_in_windows_are_those_of_the_whole(
 
     whole = knee()
     monkeypatch.setattr(orientations, "ROWS", 700)
-    monkeypatch.setattr(cells, "BLOCK_BYTES", 3000)
+    monkeypatch.setattr("marcha.ingest.formats.table.BLOCK_BYTES", 3000)
     assert np.abs(knee() - whole).max() < (1e-9 if options else np.radians(1.0))
 
 

@@ -68,7 +68,7 @@ class RepoImuCsv:
             if not _is_header(head):
                 raise MarchaError(f"{path}, line 1: not the header rows of RepoIMU ({FIRST[:40]}…)")
             mapping = _mapping(names[key], options.field_ut * 1e-6)
-            specs, blocks = open_table(path, mapping, path, report)
+            specs, blocks = open_table(path, mapping, path, report, beside=len(paths))
             channels += specs
             streams.append(rotations(blocks, [f"/reference/{names[key]}/orientation"], report))
         note_arbitrary(report, [f"/leg/{n}/mag" for n in names.values()], options.field_ut)

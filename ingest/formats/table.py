@@ -29,6 +29,7 @@ from ..mapping import (
     schema_name,
     targets,
 )
+from ..text import BLOCK_BYTES
 from ..timestamps import MOST_NS, TimestampRepair, nanoseconds
 
 #: Share of the full scale at which a 16-bit converter says its last count.
@@ -82,7 +83,7 @@ class Table:
 
 
 def open_table(
-    path: Path, mapping: Mapping, map_file: Path, report: ReportBuilder
+    path: Path, mapping: Mapping, map_file: Path, report: ReportBuilder, *, beside: int = 1
 ) -> tuple[list[ChannelSpec], Iterator[tuple[str, pl.DataFrame]]]:
     """Return the channels of a mapped table, and the blocks that read it.
 
@@ -98,6 +99,8 @@ def open_table(
         Where the mapping stands, for messages.
     report : ReportBuilder
         Takes what is found.
+    beside : int
+        So many tables are read side by side: all together hold as much as two that are read alone.
 
     Raises
     ------
@@ -112,7 +115,14 @@ def open_table(
         names = tuple(t.name for t in parts)
         channels.append(ChannelSpec(topic.name, schema_name(topic), topic.frame, names, topic.metadata))
     files = [
-        _File(map_file, f, mapping, topics, report, subject=f"{f.name}: " if len(by_file) > 1 else "")
+        _File(
+            map_file,
+            Cells(f, mapping.layout, BLOCK_BYTES * 2 // max(2, beside)),
+            mapping,
+            topics,
+            report,
+            subject=f"{f.name}: " if len(by_file) > 1 else "",
+        )
         for f, topics in by_file.items()
     ]
     return channels, _blocks(files, report)
@@ -161,17 +171,17 @@ class _File:
     def __init__(
         self,
         map_file: Path,
-        path: Path,
+        cells: Cells,
         mapping: Mapping,
         topics: list[tuple[str, Topic, list[Target]]],
         report: ReportBuilder,
         subject: str,
     ) -> None:
-        self.path = path
+        self.path = cells.path
         self._report = report
         self._layout = mapping.layout
         self._time = mapping.time
-        self._cells = Cells(path, mapping.layout)
+        self._cells = cells
         self._time_at = (
             None
             if mapping.time.column is None

@@ -119,7 +119,9 @@ class XsensText:
             layout = TextLayout(separator=header.separator, skip_rows=header.line - 1, comment="//")
             counter = next(c for c in COUNTERS if c in header.names)
             time = Time(column=counter, rate_hz=rate, rollover=COUNTER_PERIOD)
-            specs, blocks = open_table(path, Mapping(topic=topics, time=time, layout=layout), path, report)
+            specs, blocks = open_table(
+                path, Mapping(topic=topics, time=time, layout=layout), path, report, beside=len(paths)
+            )
             channels += [_final(s) for s in specs]
             final = f"/leg/{names[key]}/orientation"
             streams.append(rotations(_quaternions(blocks), [final], report))
