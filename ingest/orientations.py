@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import chain
 from typing import Annotated
 
 import msgspec
@@ -80,16 +81,19 @@ def joints_of(topics: Iterable[str]) -> dict[str, tuple[str, str]]:
 
 def with_angles(
     channels: Sequence[ChannelSpec],
-    blocks: Iterable[tuple[str, pl.DataFrame]],
+    streams: Sequence[Iterable[tuple[str, pl.DataFrame]]],
     options: OrientationOptions,
     report: ReportBuilder,
     topic: str = ANGLES_TOPIC,
 ) -> tuple[list[ChannelSpec], Iterable[tuple[str, pl.DataFrame]]]:
-    """Return channels and blocks of a source with the angles of its orientations, ``topic``, behind them."""
+    """Return channels and blocks of sources of one clock, and the angles of their orientations, ``topic``.
+
+    Only where there are such angles are sources read side by side.
+    """
     axis = axis_of(options.flexion_axis) if options.flexion_axis is not None else None
     joints = joints_of(c.topic for c in channels)
     if not joints:
-        return list(channels), blocks
+        return list(channels), chain.from_iterable(streams)
     how = FUNCTIONAL if axis is None else f"twist about {options.flexion_axis} of the frames as they are"
     spec = ChannelSpec(
         topic, JOINT_SCHEMA, "", tuple(joints), {"sign": "upper - lower segment", "definition": how}
@@ -99,15 +103,16 @@ def with_angles(
         report.note("reference_angle", f"{topic} {joint}: {how}", subject=joint)
 
     wanted = {t for pair in joints.values() for t in pair}
-    return [*channels, spec], _behind(blocks, wanted, topic, _Angles(joints, axis, say))
+    return [*channels, spec], _behind(_in_step(streams), wanted, topic, _Angles(joints, axis, say))
 
 
-def in_step(streams: Sequence[Iterator[tuple[str, pl.DataFrame]]]) -> Iterator[tuple[str, pl.DataFrame]]:
+def _in_step(streams: Sequence[Iterable[tuple[str, pl.DataFrame]]]) -> Iterator[tuple[str, pl.DataFrame]]:
     """Yield the blocks of sources of one clock, always of the one that is behind: little waits for the others."""
+    blocks = [iter(stream) for stream in streams]
     times = dict.fromkeys(range(len(streams)), -(2**63))
     while times:
         behind = min(times, key=lambda k: times[k])
-        block = next(streams[behind], None)
+        block = next(blocks[behind], None)
         if block is None:
             del times[behind]
             continue

@@ -21,7 +21,7 @@ from ..leg import (
     rotations,
 )
 from ..mapping import CellSource, Mapping, TextLayout, Time, Topic
-from ..orientations import OrientationOptions, in_step, with_angles
+from ..orientations import OrientationOptions, with_angles
 from ..text import read_blocks
 from .table import open_table
 
@@ -72,7 +72,7 @@ class RepoImuCsv:
             channels += specs
             streams.append(rotations(blocks, [f"/reference/{names[key]}/orientation"], report))
         note_arbitrary(report, [f"/leg/{n}/mag" for n in names.values()], options.field_ut)
-        channels, blocks = with_angles(channels, in_step(streams), options, report)
+        channels, blocks = with_angles(channels, streams, options, report)
         return Import(
             channels=channels,
             blocks=blocks,

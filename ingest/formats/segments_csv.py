@@ -102,7 +102,7 @@ class SegmentsCsv:
         channels, blocks = open_table(path, mapping, path, report)
         turning = [t.name for t in topics if t.schema == ORIENTATION]
         channels, blocks = with_angles(
-            channels, unseen(rotations(blocks, turning, report), report), options, report
+            channels, [unseen(rotations(blocks, turning, report), report)], options, report
         )
         return Import(
             channels=channels,

@@ -30,7 +30,7 @@ from ..leg import (
     rotations,
 )
 from ..mapping import CellSource, Mapping, TextLayout, Time, Topic
-from ..orientations import DEVICE_TOPIC, OrientationOptions, in_step, with_angles
+from ..orientations import DEVICE_TOPIC, OrientationOptions, with_angles
 from ..text import start_of
 from ..timestamps import Rate, possible_rate
 from .table import open_table
@@ -131,7 +131,7 @@ class XsensText:
                 "they are not of one session"
             )
         note_arbitrary(report, magnetic, options.field_ut)
-        channels, blocks = with_angles(channels, in_step(streams), options, report, DEVICE_TOPIC)
+        channels, blocks = with_angles(channels, streams, options, report, DEVICE_TOPIC)
         return Import(
             channels=channels,
             blocks=blocks,
