@@ -34,17 +34,18 @@ WORK: list[Any] = [
     ("pos", "f8", (2, 3)),
     ("best", "f8", (2, 3)),
     ("tangent", "f8", (2, 2, 3)),
-    ("N", "f8", (6, 6)),
-    ("L", "f8", (6, 6)),
-    ("rhs", "f8", (6,)),
-    ("jac", "f8", (6,)),
-    ("cov", "f8", (6, 6)),
+    ("N", "f8", (10, 10)),
+    ("L", "f8", (10, 10)),
+    ("rhs", "f8", (10,)),
+    ("jac", "f8", (10,)),
+    ("cov", "f8", (10, 10)),
     ("force", "f8", (2, 3)),
     ("force_jac", "f8", (2, 3, 3)),
     ("cov_axes", "f8", (4, 4)),  # in the tangent planes
     ("cost", "f8"),
     ("axis_sd", "f8", (2,)),  # rad
-    ("pos_sd", "f8"),  # m, across the axis
+    ("pos_sd", "f8"),  # m, across the axis, of both
+    ("upper_sd", "f8"),  # of the upper sensor's alone
     ("pairing", "f8"),  # share of the better sign in the misfit of both, 0.5 … 1
     ("hand", "i8"),  # sensors whose axes are left-handed: 0 none, 1 the upper, 2 the lower, 3 both
     ("turn_rms", "f8"),  # rad/s, of the relative turn about the axis
@@ -63,6 +64,12 @@ def write_sample(s: Any, row: FloatArray, i: int, turned: FloatArray) -> None:
         row[b + ACC + m] = s.acc[i, m]
         row[b + DGYR + m] = s.dgyr[i, m]
         row[b + SUM + m] = turned[m]
+
+
+@inlined
+def near(angle: float, other: float) -> float:
+    """Return ``angle`` moved by whole turns to within half a turn of ``other``."""
+    return angle - 2.0 * math.pi * math.floor((angle - other) / (2.0 * math.pi) + 0.5)
 
 
 @inlined
@@ -477,6 +484,8 @@ def fit_position(w: Any, rows: FloatArray, count: int, sd: float) -> None:
             total += scale * w.cov[3 * i + m, 3 * i + m]
             for k in range(3):
                 total -= scale * w.axis[i, m] * w.cov[3 * i + m, 3 * i + k] * w.axis[i, k]
+        if i == 0:
+            w.upper_sd = math.sqrt(max(0.0, total))
     w.pos_sd = math.sqrt(max(0.0, 0.5 * total))
     along = 0.0
     for i in range(2):

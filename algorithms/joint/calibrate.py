@@ -81,7 +81,7 @@ class JointCalibrator(Calibrator):
     Values: ``hinges``, one per pair of neighbouring segments (``joint``, ``segments``, ``axes`` in both sensors'
     frames, ``axes_sd_deg``, ``positions_m`` from the joint's centre to each sensor, ``position_sd_m``, ``pairing``,
     ``gyr_bias_rad_s``, ``acc_bias_m_s2``, ``biases_bounded``, ``skewness``, ``sign_by``
-    (stated, swings, nothing), ``long_axes``, ``long_axes_guessed``, ``usable``, ``why``), and
+    (stated, swings, pose, nothing), ``long_axes``, ``long_axes_guessed``, ``usable``, ``why``), and
     ``rot_sb_<segment>``, the rotation from the sensor's to the segment's frame (x flexion axis, z long axis upwards,
     y = z × x), row by row.
     """
@@ -193,6 +193,7 @@ class JointCalibrator(Calibrator):
             ),
             axes_sd=w["axis_sd"].copy(),
             position_sd=float(w["pos_sd"]),
+            upper_sd=float(w["upper_sd"]),
             pairing=float(w["pairing"]) if paired else 0.5,
             biases=np.zeros((2, 3)),
             acc_biases=np.zeros((2, 3)),
@@ -203,7 +204,7 @@ class JointCalibrator(Calibrator):
         if w["pairing"] < hingefit.DOUBTFUL:
             few = np.ascontiguousarray(rows[:: max(1, len(rows) // 1000)])
             short = max(1, round(lag * len(few) / len(rows)))
-            w["hand"] = handedness.hand_of_pair(few, short, p.gravity)
+            w["hand"] = handedness.neighbours(few, short, p.gravity).hand
         mirrored = handedness.left_handed_of(judged[0], (upper, lower), int(w["hand"]))
         oriented = np.zeros(1, mounting.RECORD)
         o = oriented[0]
@@ -212,7 +213,8 @@ class JointCalibrator(Calibrator):
             o["given_axis"][i], o["given_up"][i] = mount[0], mount[2]
             o["stated"][i], o["up_stated"][i] = stated[segment], bool(per_segment(p.up, segment))
         o["is_knee"] = joint == "knee"
-        o["axis"] = best.axes
+        o["axis"], o["pos"] = best.axes, best.positions
+        o["upper_sd"], o["gravity"] = best.upper_sd, p.gravity
         mounting.orient(oriented[0], rows, len(rows), lag)
         best = best._replace(axes=o["axis"].copy())
         sd = np.degrees(best.axes_sd)

@@ -27,9 +27,9 @@ import numpy as np
 from ..contract import FloatArray
 from ..numerics.compiled import compiled
 from . import merge, selfaligned
+from .axisfit import near
 from .chain_turn import square, turn
 from .chain_zero import axis_unknown, spread_of_zero
-from .selfaligned import near
 
 HINGE, TWO, FREE = 0, 1, 2
 FIRST_MISFITS, MISFITS = 300, 10_000
@@ -51,6 +51,8 @@ DTYPE = np.dtype(
         ("anchor", "f8", (3,)),
         ("anchored", "i8"),
         ("on_line", "i8"),
+        ("first_ns", "i8"),  # time of the first sample, and of the first that had an angle
+        ("begin_ns", "i8"),
         ("q_gyr", "f8"),
         ("k_gyr", "f8"),  # (s/√Hz)²: growth of q_gyr with the rate
         ("q_bias", "f8"),
@@ -440,6 +442,7 @@ def step(s: Any) -> bool:
         for i in range(s.n):
             restart(s, i)
         s.on_line = 1
+        s.first_ns = s.now
         return True
     unknown = axis_unknown(s)
     if unknown:

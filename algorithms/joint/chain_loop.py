@@ -9,7 +9,7 @@ from ..contract import FloatArray, IntArray
 from ..numerics.compiled import compiled
 from . import merge
 from .chain import FREE, HINGE, measure_angles, step
-from .chain_zero import set_zero, stated_sd
+from .chain_zero import angle_unknown, set_zero, stated_sd
 
 
 @compiled
@@ -42,8 +42,11 @@ def emit(s: Any, out: FloatArray) -> None:
         if s.valid[i] == 1:
             quaternion(s.rot[i], out, column)
         column += 4
+    defined = not angle_unknown(s)
+    if defined and s.begin_ns == 0:
+        s.begin_ns = s.now
     for j in range(s.n - 1):
-        both = s.valid[j] == 1 and s.valid[j + 1] == 1
+        both = defined and s.valid[j] == 1 and s.valid[j + 1] == 1
         for k in range(1 if s.type[j] == HINGE else 3):
             if both:
                 out[column] = s.angle[j, k]
@@ -51,7 +54,7 @@ def emit(s: Any, out: FloatArray) -> None:
                     out[column] -= s.zero_sum[j] / max(1, s.zero_count[j])
             column += 1
     for j in range(s.n - 1):
-        if s.valid[j] == 1 and s.valid[j + 1] == 1:
+        if defined and s.valid[j] == 1 and s.valid[j + 1] == 1:
             out[column] = stated_sd(s, j)
         column += 1
     for i in range(s.n):

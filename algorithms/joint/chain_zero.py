@@ -6,12 +6,10 @@ import math
 from typing import Any
 
 from ..numerics.compiled import compiled
-from .mounting import GUESS_DEG, NOTHING
-from .selfaligned import near
+from .axisfit import near
+from .mounting import GUESS_DEG, NOTHING, guess_deg
 
 GUESS = math.radians(GUESS_DEG)
-UNKNOWN = math.radians(60.0)
-"""Standard deviation of a flexion, each segment, about an axis that is neither stated nor yet found."""
 
 
 @compiled
@@ -47,13 +45,18 @@ def axis_unknown(s: Any) -> bool:
 
 
 @compiled
+def angle_unknown(s: Any) -> bool:
+    """Return whether there is no angle: about an axis that is not known, or of unknown sign and zero."""
+    guessed = s.guessed[0] == 1 or s.guessed[1] == 1
+    return axis_unknown(s) or (s.sign_by == NOTHING and guessed)
+
+
+@compiled
 def axis_var(s: Any, angle: float) -> float:
     """Return the variance of ``angle`` from an axis that is not known well, or of unknown sign (truth ±angle).
 
     A stated axis that was not found is worth what the sensors turn about it: nothing is added on a robot's plain hinge.
     """
-    if axis_unknown(s):
-        return 2.0 * UNKNOWN * UNKNOWN
     loose = (2.0 - s.about[0] - s.about[1]) * GUESS * GUESS
     return loose + (2.0 * angle * angle if s.sign_by == NOTHING else 0.0)
 
@@ -71,6 +74,7 @@ def innovation_scale(s: Any, j: int) -> float:
 def spread_of_zero(s: Any) -> None:
     """Write the variance of a hinge's zero by the mountings; a guessed long axis is known less well."""
     s.mount_var = 0.0
+    guess = math.radians(guess_deg(s.sign_by, s.guessed[0] == 1 and s.guessed[1] == 1))
     for i in range(2):
-        sd = max(s.sd_mount, GUESS) if s.guessed[i] == 1 else s.sd_mount
+        sd = max(s.sd_mount, guess) if s.guessed[i] == 1 else s.sd_mount
         s.mount_var += sd * sd

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -25,6 +26,8 @@ from .merge import ENCODER, JOINTS, SEGMENTS
 if TYPE_CHECKING:
     import polars as pl
 
+OTHER_AXIS_DEG = 45.0
+"""A joint that turns about an axis so far off the one that is used is not the joint whose angle is drawn."""
 IMU_COLUMNS = ("acc_x", "acc_y", "acc_z", "gyr_x", "gyr_y", "gyr_z")
 
 
@@ -255,6 +258,42 @@ class JointEstimator(KernelEstimator):
                 out[:, j] = table[columns[fit[0]]].to_numpy()
         return out
 
+    def finds_axes(self) -> bool:
+        """Whether the axes are found from the motion; remarks on them are the estimator's own then."""
+        return "learn" in (self.dtype.names or ()) and bool(self.state[0]["learn"])
+
+    def _other_axes(self, pairs: Sequence[handedness.Neighbours | None]) -> list[Remark]:
+        """Say where a joint turns about another axis than the one that is used."""
+        used = mounts(self.params, self.segments, self.context)[:, 0]
+        remarks = []
+        for i, (joint, pair) in enumerate(zip(self.joint_names(), pairs, strict=True)):
+            if pair is None or not pair.sharp:
+                continue
+            for name, axis, own in zip(self.segments[i : i + 2], pair.axes, used[i : i + 2], strict=True):
+                off_deg = math.degrees(math.acos(min(1.0, abs(float(axis @ own)))))
+                if off_deg <= OTHER_AXIS_DEG:
+                    continue
+                stated = self._axis_stated(name)
+                which = (
+                    "the stated axis" if stated else "x, taken where axis is not stated: its angles are wrong"
+                )
+                remarks.append(
+                    Remark(
+                        "mounting_doubtful",
+                        f"{joint}: the {name}'s sensor turns about {np.round(axis, 2).tolist()}, {off_deg:.0f}° off "
+                        f"{which}; correct axis, or calibrate (marcha calibrate joint)",
+                        fatal=not stated,
+                    )
+                )
+        return remarks
+
+    def _axis_stated(self, segment: str) -> bool:
+        calibration = self.context.calibrations.get("joint")
+        calibrated = (
+            calibration is not None and calibration.usable and f"rot_sb_{segment}" in calibration.values
+        )
+        return calibrated or states_axis(self.params, segment, self.context.channels)
+
     def snapshot(self) -> Any:
         """Return a copy of the packed state."""
         return self.state.copy()
@@ -302,10 +341,13 @@ class JointEstimator(KernelEstimator):
                     )
                 )
         hand = int(s["hand"]) if "hand" in (self.dtype.names or ()) else 0
+        pairs = handedness.pairs_of(s, self.segments, self.params.gravity)
         mirrored = handedness.left_handed_of(s, self.segments, hand)
-        mirrored = mirrored or handedness.left_handed_neighbours(s, self.segments, self.params.gravity)
+        mirrored = mirrored or handedness.left_handed_neighbours(pairs, self.segments)
         if mirrored:
             remarks.append(mirrored_remark(mirrored))
+        elif not self.finds_axes():
+            remarks += self._other_axes(pairs)
         streams: Mapping[int, str] = {**dict(enumerate(self.segments)), ENCODER: "encoder"}
         for i, name in streams.items():
             missed = int(s["missed"][i])

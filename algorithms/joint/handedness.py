@@ -13,7 +13,7 @@ doubt nothing is said. Where two neighbouring sensors span a hinge, :func:`.hing
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -220,8 +220,19 @@ def left_handed(s: Any, i: int) -> bool:
     return plain > LEAST_RMS and reversed_rate < BETTER * plain
 
 
-def hand_of_pair(rows: FloatArray, lag: int, gravity: float) -> int:
-    """Return which of two sensors are left-handed (a bit each), by the hinge between them; 0 where that is not shown.
+class Neighbours(NamedTuple):
+    """What the hinge between two sensors shows: axes (2, 3) in the sensors' frames, which are left-handed (a bit each).
+
+    ``sharp``: whether the axes are known to 6°, so that it is a hinge and moves.
+    """
+
+    axes: FloatArray
+    hand: int
+    sharp: bool
+
+
+def neighbours(rows: FloatArray, lag: int, gravity: float) -> Neighbours:
+    """Return what two sensors show of the hinge between them.
 
     Parameters
     ----------
@@ -233,27 +244,34 @@ def hand_of_pair(rows: FloatArray, lag: int, gravity: float) -> int:
         m/s².
     """
     work = np.zeros(1, axisfit.WORK_DTYPE)
-    work[0]["axis"] = np.eye(3)[0]
+    w = work[0]
+    w["axis"] = np.eye(3)[0]
     about = rows, len(rows), lag, hingefit.SD_GYR, hingefit.SD_ACC, gravity
-    hingefit.fit(work[0], *about, True)
-    if work[0]["pairing"] < hingefit.DOUBTFUL:
+    paired = hingefit.fit(work[0], *about, True)
+    axes = w["axis"].copy()
+    sharp = bool(paired and w["pairing"] > hingefit.PAIRED and w["axis_sd"].max() < hingefit.SHARP)
+    if w["pairing"] < hingefit.DOUBTFUL:
         hingefit.find_hand(work[0], *about)
-    return int(work[0]["hand"])
+    return Neighbours(axes, int(w["hand"]), sharp)
 
 
-def left_handed_neighbours(s: Any, segments: Sequence[str], gravity: float) -> list[str]:
-    """Return the segments whose sensors are left-handed by the joints with their neighbours, where these are hinges."""
-    names: list[str] = []
+def pairs_of(s: Any, segments: Sequence[str], gravity: float) -> list[Neighbours | None]:
+    """Return of all neighbouring segments what the kept samples show; None where these are too few."""
+    pairs: list[Neighbours | None] = []
     for i in range(len(segments) - 1):
         good = s["hand_valid"][: s["hand_kept"], i : i + 2].all(axis=1)
-        if good.sum() >= LEAST_ROWS:
-            columns = slice(axisfit.WIDTH * i, axisfit.WIDTH * (i + 2))
-            rows = np.ascontiguousarray(s["hand_rows"][: s["hand_kept"], columns][good])
-            hand = hand_of_pair(rows, round(0.3 / SPACING_S), gravity)
-            names += [
-                name for j, name in enumerate(segments[i : i + 2]) if hand >> j & 1 and name not in names
-            ]
-    return names
+        columns = slice(axisfit.WIDTH * i, axisfit.WIDTH * (i + 2))
+        rows = np.ascontiguousarray(s["hand_rows"][: s["hand_kept"], columns][good])
+        enough = len(rows) >= LEAST_ROWS
+        pairs.append(neighbours(rows, round(0.3 / SPACING_S), gravity) if enough else None)
+    return pairs
+
+
+def left_handed_neighbours(pairs: Sequence[Neighbours | None], segments: Sequence[str]) -> list[str]:
+    """Return the segments whose sensors are left-handed by the joints with their neighbours, where these are hinges."""
+    hands = [pair.hand if pair else 0 for pair in pairs]
+    before = [0, *hands]
+    return [n for i, n in enumerate(segments) if before[i] & 2 or (i < len(hands) and hands[i] & 1)]
 
 
 def left_handed_of(s: Any, segments: Sequence[str], hand: int) -> list[str]:

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..numerics.compiled import compiled
 from . import merge, selfaligned
-from .selfaligned import near
+from .axisfit import near
 
 LOCAL, GLOBAL, ONE, SELF = 0, 1, 2, 3  # kinds: FKL; FKG; SMp and SMe; SMeA
 DROP, ZERO, HOLD = 0, 1, 2

@@ -19,14 +19,27 @@ SKEWED = 0.7
 """Skewness beyond which a knee's swings say which way it bends."""
 GUESS_DEG = 30.0
 """How well the mean direction of gravity stands for a segment's long axis, standing or walking."""
+BODY_DEG = 10.0
+"""How well, a segment, a body's most extended posture is straight: no knee bends backward; a crouch gait has 20°."""
 ALIKE, OFTEN = 0.87, 0.25
 """A long axis that is not stated is the convention's where the force is so near it (cosine, 30°) so often (share)."""
 MAINLY = 0.8
 """Share of a sensor's squared rate about the convention's flexion axis above which it is taken where none is found."""
 STILL = 0.05
 """Root mean square of a rate (rad/s) below which it says nothing."""
-STATED, SWINGS, NOTHING = 0, 1, 2
-SIGNS = ("stated", "swings", "nothing")
+QUIET_RATE, QUIET_FORCE = 1.0, 0.1
+"""Rates (rad/s) and share of gravity by which the force differs from it, up to which a force shows the vertical."""
+PLACED = 0.4
+"""Standard deviation of the joint's position over its distance above which it says nothing of the long axis."""
+BINS = 72
+"""Bins of the joint's angle, a turn."""
+ENDS = 0.05
+"""Share of the samples beyond each end of the joint's range."""
+UPRIGHT, LEAST_QUIET = 0.3, 30
+"""By so much the cosine of the upper segment to the vertical must differ between the ends of the joint's range, for the
+lever points 20 to 30° off the long axis; fewest quiet samples."""
+STATED, SWINGS, NOTHING, POSE = 0, 1, 2, 3
+SIGNS = ("stated", "swings", "nothing", "pose")
 """What the sign of the axes is by."""
 
 FIELDS: list[Any] = [
@@ -37,6 +50,11 @@ FIELDS: list[Any] = [
     ("up", "f8", (2, 3)),  # the long axis of the segment in each sensor's frame
     ("guessed", "i8", (2,)),  # how the long axis is known: 0 stated, 1 guessed, 2 not at all
     ("mean_force", "f8", (3,)),
+    ("pose", "f8"),  # sign of the bend by the upright pose: of angles against it; 0 where there is none
+    ("swings", "f8", (BINS,)),  # samples by the joint's turn about its running mean
+    ("quiet", "f8", (BINS,)),  # quiet samples by the joint's angle
+    ("upright", "f8", (BINS,)),  # the sums of their upper segment's cosine to the vertical
+    ("pose_up", "f8", (2, 3)),  # vertical in both sensors' frames in that pose, not normalized
     ("below", "f8", (2,)),  # 1 where the sensor sits above the joint, −1 below, 0 where that says nothing
     ("is_knee", "i8"),
     ("skew", "f8"),  # of the joint's swings
@@ -46,7 +64,9 @@ FIELDS: list[Any] = [
 ]
 """Fields of a packed record, beside those of :mod:`.axisfit`."""
 
-RECORD = record_type(("axis", "f8", (2, 3)), *FIELDS)
+RECORD = record_type(
+    ("axis", "f8", (2, 3)), ("pos", "f8", (2, 3)), ("upper_sd", "f8"), ("gravity", "f8"), *FIELDS
+)
 """What :func:`orient` reads and writes."""
 
 
@@ -70,11 +90,108 @@ def force_across(s: Any, rows: FloatArray, count: int, i: int) -> float:
 
 
 @compiled
+def lean(s: Any, rows: FloatArray, k: int, i: int) -> float:
+    """Return the angle of sensor ``i``'s lever to the vertical, about the axis; NaN where the sample is not quiet.
+
+    The lever, made upward, stands for the long axis: the thigh's sensor sits above the knee, the shank's below.
+    """
+    g = rows[k, axisfit.WIDTH * i + axisfit.GYR : axisfit.WIDTH * i + axisfit.GYR + 3]
+    f = rows[k, axisfit.WIDTH * i + axisfit.ACC : axisfit.WIDTH * i + axisfit.ACC + 3]
+    j, upward = s.axis[i], 1.0 if i == 0 else -1.0
+    size = math.sqrt(f[0] * f[0] + f[1] * f[1] + f[2] * f[2])
+    rate = g[0] * g[0] + g[1] * g[1] + g[2] * g[2]
+    if rate > QUIET_RATE * QUIET_RATE or abs(size - s.gravity) > QUIET_FORCE * s.gravity:
+        return math.nan
+    force_along, lever_along = 0.0, 0.0
+    for m in range(3):
+        force_along += f[m] * j[m]
+        lever_along += s.pos[i, m] * j[m]
+    across, dot = 0.0, 0.0
+    for m in range(3):
+        n, o = (m + 1) % 3, (m + 2) % 3
+        dot += (s.pos[i, m] - lever_along * j[m]) * (f[m] - force_along * j[m])
+        across += j[m] * (f[n] * s.pos[i, o] - f[o] * s.pos[i, n])
+    return math.atan2(upward * across, upward * dot)
+
+
+@inlined
+def bin_of(angle: float) -> int:
+    """Return the bin of an angle within half a turn of 0."""
+    return min(BINS - 1, int((angle + math.pi) / (2.0 * math.pi) * BINS))
+
+
+@compiled
+def find_pose(s: Any, rows: FloatArray, count: int) -> None:
+    """Write to ``s.pose`` which way a knee bends from its upright pose, to ``s.pose_up`` the vertical in that pose.
+
+    In standing the lever from the knee's centre to the thigh's sensor is upright, in sitting or squatting it is not,
+    and a knee bends one way only from there. Of the two ends of the joint's range among quiet samples that with the
+    more upright thigh is that pose; where they differ little (walking) nothing is said. The shank hardly turns, so its
+    lever is hardly known: it only counts the joint's angle.
+    """
+    s.pose = 0.0
+    for i in range(2):
+        size = math.sqrt(s.pos[i, 0] ** 2 + s.pos[i, 1] ** 2 + s.pos[i, 2] ** 2)
+        if size < 0.05 or (i == 0 and s.upper_sd > PLACED * size):
+            return
+    for b in range(BINS):
+        s.quiet[b], s.upright[b] = 0.0, 0.0
+    total = 0.0
+    for k in range(count):
+        upper, lower = lean(s, rows, k, 0), lean(s, rows, k, 1)
+        if math.isfinite(upper) and math.isfinite(lower):
+            b = bin_of(axisfit.near(upper - lower, 0.0))
+            s.quiet[b] += 1.0
+            s.upright[b] += math.cos(upper)
+            total += 1.0
+    if total < LEAST_QUIET:
+        return
+    low, high = int(end_of(s.quiet, ENDS)), min(BINS - 1, int(end_of(s.quiet, 1.0 - ENDS)))
+    apart = upright_near(s, low) - upright_near(s, high)
+    if abs(apart) < UPRIGHT:
+        return
+    s.pose = 1.0 if apart > 0.0 else -1.0
+    straight = low if apart > 0.0 else high
+    for i in range(2):
+        for m in range(3):
+            s.pose_up[i, m] = 0.0
+    for k in range(count):
+        upper, lower = lean(s, rows, k, 0), lean(s, rows, k, 1)
+        quiet = math.isfinite(upper) and math.isfinite(lower)
+        if quiet and abs(bin_of(axisfit.near(upper - lower, 0.0)) - straight) <= 2:
+            for i in range(2):
+                for m in range(3):
+                    s.pose_up[i, m] += rows[k, axisfit.WIDTH * i + axisfit.ACC + m]
+
+
+@compiled
+def end_of(counts: FloatArray, share: float) -> float:
+    """Return where in a histogram (bins,), in bins, ``share`` of the samples lies below."""
+    wanted, below = share * counts.sum(), 0.0
+    for b in range(counts.shape[0]):
+        if counts[b] > 0.0 and below + counts[b] >= wanted:
+            return b + (wanted - below) / counts[b]
+        below += counts[b]
+    return float(counts.shape[0])
+
+
+@compiled
+def upright_near(s: Any, b: int) -> float:
+    """Return the mean cosine of the upper segment to the vertical in bin ``b`` and its neighbours."""
+    total, weight = 0.0, 0.0
+    for c in range(max(0, b - 2), min(BINS, b + 3)):
+        total += s.upright[c]
+        weight += s.quiet[c]
+    return total / weight
+
+
+@compiled
 def set_long_axes(s: Any, rows: FloatArray, count: int) -> None:
     """Write the long axes, upwards, to ``s.up`` and whether they are guessed to ``s.guessed``.
 
     What is stated is taken. Where the axis that was found lies far off the stated one, or nothing is stated and the
-    sensors contradict the convention, the mean force stands for it, as if the segment were upright on average.
+    sensors contradict the convention, the force in the upright pose stands for it, or else the mean force, as if the
+    segment were upright on average.
     """
     for i in range(2):
         near, beside = 0.0, 0.0
@@ -84,6 +201,9 @@ def set_long_axes(s: Any, rows: FloatArray, count: int) -> None:
         often = force_across(s, rows, count, i)
         usual = abs(near) > NEAR and (s.stated[i] == 1 or often > OFTEN)
         s.guessed[i] = 0 if (abs(beside) < 0.9 if s.up_stated[i] == 1 else usual) else 1
+        if s.pose != 0.0:
+            for m in range(3):
+                s.mean_force[m] = s.pose_up[i, m]
         size, least = 0.0, 0
         for m in range(3):
             size += s.mean_force[m] ** 2
@@ -120,10 +240,13 @@ def turned(w: Any, rows: FloatArray, k: int) -> float:
 def skewness(w: Any, rows: FloatArray, count: int, lag: int) -> float:
     """Return the skewness of the joint's turn about its running mean over ∓ 8 ``lag`` samples.
 
-    A knee that walks swings far to one side of its mean (about 1.1 in flexion); without strides it says little.
+    A knee that walks swings far to one side of its mean (about 1.1 in flexion); without strides it says little. Also
+    counts the turns in ``w.swings``.
     """
     wide = 8 * lag
     square, cube = 0.0, 0.0
+    for b in range(BINS):
+        w.swings[b] = 0.0
     for k in range(count):
         first = max(0, k - wide)
         last = min(count - 1, k + wide)
@@ -131,6 +254,7 @@ def skewness(w: Any, rows: FloatArray, count: int, lag: int) -> float:
         for n in range(first, last + 1, lag):
             mean += turned(w, rows, n)
         e = turned(w, rows, k) - mean / ((last - first) // lag + 1)
+        w.swings[bin_of(axisfit.near(e, 0.0))] += 1.0
         square += e * e
         cube += e * e * e
     square /= count
@@ -141,9 +265,13 @@ def skewness(w: Any, rows: FloatArray, count: int, lag: int) -> float:
 def orient(s: Any, rows: FloatArray, count: int, lag: int) -> None:
     """Set the common sign of the axes ``s.axis`` and what it is by, and the long axes ``s.up``.
 
-    A stated axis decides. Where none is stated a walking knee's swings do; else the sign is not known.
+    A stated axis decides. Where none is stated a walking knee's swings do, or the side to which a knee bends from its
+    upright pose; else the sign is not known.
     """
     s.skew = skewness(s, rows, count, lag)
+    s.pose = 0.0
+    if s.is_knee == 1:
+        find_pose(s, rows, count)
     s.about[0], s.about[1] = 1.0, 1.0
     near, default = 0.0, 0.0
     for i in range(2):
@@ -155,19 +283,40 @@ def orient(s: Any, rows: FloatArray, count: int, lag: int) -> None:
         if i == 0:
             default = dot
     shown, by = default, NOTHING
-    swings = s.skew if s.is_knee == 1 and abs(s.skew) > SKEWED else 0.0
+    bends, bends_by = s.pose, POSE
+    if s.is_knee == 1 and abs(s.skew) > SKEWED:
+        bends, bends_by = s.skew, SWINGS
     if near != 0.0:
         # Far off the stated axis its sign is taken, but believed only where the knee says the same.
-        shown, by = near, STATED if abs(near) > NEAR or near * swings > 0.0 else NOTHING
-    elif swings != 0.0:
-        shown, by = swings, SWINGS
+        shown, by = near, STATED if abs(near) > NEAR or near * bends > 0.0 else NOTHING
+    elif bends != 0.0:
+        shown, by = bends, bends_by
     s.sign_by = by
     if shown < 0.0:
         s.skew = -s.skew
+        for b in range(BINS // 2):
+            s.swings[b], s.swings[BINS - 1 - b] = s.swings[BINS - 1 - b], s.swings[b]
         for i in range(2):
             for m in range(3):
                 s.axis[i, m] = -s.axis[i, m]
     set_long_axes(s, rows, count)
+    if by == SWINGS and s.guessed[0] == 1 and s.guessed[1] == 1:
+        extend(s)
+
+
+@compiled
+def extend(s: Any) -> None:
+    """Turn the lower long axis so that a walking knee's most extended posture is zero.
+
+    The mean forces alone made zero the mean posture, which is flexed by some 20°.
+    """
+    flexed = math.pi - 2.0 * math.pi / BINS * end_of(s.swings, ENDS)  # of the mean, against the extended end
+    j, up = s.axis[1], s.up[1]
+    c, t = math.cos(flexed), math.sin(flexed)
+    x = c * up[0] - t * (j[1] * up[2] - j[2] * up[1])
+    y = c * up[1] - t * (j[2] * up[0] - j[0] * up[2])
+    z = c * up[2] - t * (j[0] * up[1] - j[1] * up[0])
+    up[0], up[1], up[2] = x, y, z
 
 
 @compiled
@@ -204,6 +353,12 @@ def suppose(s: Any, rows: FloatArray, count: int, lag: int) -> None:
 FAR, UNSTATED = "the axis found lies more than 45° off the stated one", "axis is not stated"
 
 
+@inlined
+def guess_deg(sign_by: int, both: bool) -> float:
+    """Return how well a guessed long axis is known, by what the sign is by and whether both are guessed."""
+    return BODY_DEG if both and sign_by in (SWINGS, POSE) else GUESS_DEG
+
+
 def guess_remarks(s: Any, segments: Sequence[str], fatal: bool = False) -> list[Remark]:
     """Say what of the mounting is guessed, and by what; ``fatal`` where the stated uncertainty does not hold it."""
     guessed = [n for n, g in zip(segments, s["guessed"], strict=False) if g]
@@ -227,12 +382,12 @@ def guess_remarks(s: Any, segments: Sequence[str], fatal: bool = False) -> list[
         return [
             Remark(
                 "mounting_guessed",
-                f"{' and '.join(guessed)}: {why}: the long axis is a guess (± {GUESS_DEG:.0f}°)"
-                + (
-                    f", the sign of the knee that of its swings (skewness {s['skew']:.1f})"
-                    if by == SWINGS
-                    else ""
-                )
+                f"{' and '.join(guessed)}: {why}: the long axis is a guess (± {guess_deg(by, len(guessed) > 1):.0f}°)"
+                + {
+                    SWINGS: ", the sign of the knee that of its swings, zero their straight end "
+                    f"(skewness {s['skew']:.1f})",
+                    POSE: ", the sign of the knee that of its bend from the upright pose, which is zero",
+                }.get(by, "")
                 + "; give axis and up, or calibrate with a static span",
                 fatal=fatal,
             )

@@ -15,6 +15,8 @@ from .source import JOINT_STATE, NAMED, axis_remarks, set_up_axes
 
 QUATERNION = "geometry_msgs/msg/QuaternionStamped"
 QUAT = ("quat_w", "quat_x", "quat_y", "quat_z")
+LATE_S = 0.5
+"""A hinge's angle that begins later is remarked."""
 TYPES = ("hinge", "two-axis", "free")
 
 
@@ -215,8 +217,19 @@ class JointHinge(ChainEstimator):
         spread_of_zero(s)
 
     def remarks(self) -> list[Remark]:
-        """Say whether the axes are known."""
-        return super().remarks() + axis_remarks(self.state[0], self.segments, fatal=False)
+        """Say whether the axes are known, and since when."""
+        s = self.state[0]
+        remarks = super().remarks() + axis_remarks(s, self.segments, fatal=False)
+        late_s = (int(s["begin_ns"]) - int(s["first_ns"])) * 1e-9
+        if late_s > LATE_S:
+            remarks.append(
+                Remark(
+                    "angle_begins",
+                    f"{self.joint_names()[0]}: no angle in the first {late_s:.1f} s: axis is not stated and was found "
+                    "then; give axis, or use joint.smooth, which looks at the whole recording first",
+                )
+            )
+        return remarks
 
 
 class JointRelative(ChainEstimator):

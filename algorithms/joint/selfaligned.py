@@ -11,14 +11,17 @@ import math
 from typing import Any
 
 from ..numerics.compiled import compiled, inlined
-from . import axisfit, hingefit, mounting
+from . import axisfit, hingefit, mounting, turnfit
 
 STORE = 1024
+SETTLED_S = 8.0
+"""Motion (s), some strides, from which on the zero that it shows is kept."""
 STILL_RATE = 0.05
 """Rate (rad/s) of both sensors below which a sample is not kept."""
 
 FIELDS: list[Any] = [
     *axisfit.WORK,
+    *turnfit.WORK,
     *mounting.FIELDS,
     ("base", "f8", (2, 2, 3)),  # x_i, y_i of eq 74 in each sensor's frame
     ("rows", "f8", (STORE, axisfit.COLUMNS)),
@@ -30,6 +33,10 @@ FIELDS: list[Any] = [
     ("elapsed", "f8"),  # in motion
     ("fit_at", "f8"),
     ("fits", "i8"),
+    ("held", "i8"),  # whether sign and zero were shown by a body's motion; then how, long axes, the last axes
+    ("held_by", "i8"),
+    ("held_up", "f8", (2, 3)),
+    ("held_axis", "f8", (2, 3)),
     ("known", "i8"),  # whether the axes are usable: given, or identified with a good verdict
     ("sd_gyr", "f8"),
     ("sd_acc", "f8"),
@@ -49,12 +56,6 @@ FIELDS: list[Any] = [
     ("ax", "f8", (2,)),
     ("aP", "f8", (2, 2)),
 ]
-
-
-@inlined
-def near(angle: float, other: float) -> float:
-    """Return ``angle`` moved by whole turns to within half a turn of ``other``."""
-    return angle - 2.0 * math.pi * math.floor((angle - other) / (2.0 * math.pi) + 0.5)
 
 
 @compiled
@@ -99,14 +100,26 @@ def identify(s: Any, lag: int) -> None:
         hingefit.find_hand(s, s.rows, n, lag, s.sd_gyr, s.sd_acc, s.gravity)
         reset_axes(s)
         paired = hingefit.fit(s, s.rows, n, lag, s.sd_gyr, s.sd_acc, s.gravity, s.learn == 2)
-    if s.learn == 2 and s.pos_sd > 0.05:  # not observable: no lever rather than a wrong one
-        for i in range(2):
-            for m in range(3):
-                s.pos[i, m] = 0.0
     s.fits += 1
+    s.block_cost = 0.0
+    if s.hand == 0 and not (paired and observable(s)):
+        turnfit.fit(s, s.rows, n, lag, s.sd_gyr, s.sd_acc)
+        paired = s.block_cost < turnfit.FITS
     if paired and s.hand == 0 and observable(s):
         s.known = 1
         mounting.orient(s, s.rows, n, lag)
+        hold_mounting(s)
+        if s.learn == 2 and s.pos_sd > 0.05:  # not observable: no lever rather than a wrong one
+            for i in range(2):
+                for m in range(3):
+                    s.pos[i, m] = 0.0
+    elif (
+        s.held == 1 and s.hand == 0
+    ):  # what was found stays, and the remark says that it does not hold any more
+        s.known = 0
+        for i in range(2):
+            for m in range(3):
+                s.axis[i, m] = s.held_axis[i, m]
     else:
         s.known = 0
         reset_axes(s)
@@ -115,6 +128,33 @@ def identify(s: Any, lag: int) -> None:
                 s.pos[i, m] = 0.0
         s.pos_sd = 1.0
         mounting.suppose(s, s.rows, n, lag)
+
+
+@compiled
+def hold_mounting(s: Any) -> None:
+    """Keep the sign and the zero that a body's motion has shown, so that neither jumps as the data grow.
+
+    Later data may show the sign no longer; the zero is kept from :data:`SETTLED_S` of motion on.
+    """
+    shown = s.sign_by == mounting.SWINGS or s.sign_by == mounting.POSE
+    dot = 0.0
+    for m in range(3):
+        dot += s.axis[0, m] * s.held_axis[0, m]
+    if shown and (s.held == 0 or dot < 0.0 or s.elapsed < SETTLED_S):
+        s.held, s.held_by = 1, s.sign_by
+        for i in range(2):
+            for m in range(3):
+                s.held_up[i, m] = s.up[i, m]
+    elif s.held == 1 and (shown or s.sign_by == mounting.NOTHING):
+        s.sign_by = s.held_by
+        s.skew = -s.skew if dot < 0.0 else s.skew
+        for i in range(2):
+            for m in range(3):
+                s.up[i, m] = s.held_up[i, m]
+                s.axis[i, m] = -s.axis[i, m] if dot < 0.0 else s.axis[i, m]
+    for i in range(2):
+        for m in range(3):
+            s.held_axis[i, m] = s.axis[i, m]
 
 
 @compiled
@@ -160,6 +200,8 @@ def watch(s: Any) -> bool:
         s.stride *= 2
     if s.elapsed < s.fit_at or s.kept < 60:
         return False
+    if s.known == 1 and s.block_cost > 0.0 and s.stride * s.dt > turnfit.DENSE_S:
+        return False  # what was found with denser samples stays
     s.fit_at = max(1.25 * s.elapsed, s.elapsed + 1.0)
     lag = max(1, int(0.3 / (s.stride * max(1e-4, s.dt)) + 0.5))
     identify(s, lag)
@@ -192,7 +234,7 @@ def joint_angle(s: Any) -> None:
     uu, vv = ux * ux + uy * uy, vx * vx + vy * vy
     g2 = s.gravity * s.gravity
     s.alpha_spread = 0.5 * (g2 / max(uu, 1e-6 * g2) + g2 / max(vv, 1e-6 * g2))
-    s.alpha_acc = near(math.atan2(ux * vy - uy * vx, ux * vx + uy * vy), s.alpha)
+    s.alpha_acc = axisfit.near(math.atan2(ux * vy - uy * vx, ux * vx + uy * vy), s.alpha)
     if s.alpha_on == 0:
         s.alpha_gyr = s.alpha_acc
         s.alpha = s.alpha_acc
@@ -204,7 +246,7 @@ def joint_angle(s: Any) -> None:
     r = s.alpha_r * max(1.0, s.alpha_spread)
     if s.alpha_seel == 1:
         weight = s.alpha_lambda / max(1.0, s.alpha_spread)
-        s.alpha = weight * near(s.alpha_acc, s.alpha) + (1.0 - weight) * (s.alpha + turn)
+        s.alpha = weight * axisfit.near(s.alpha_acc, s.alpha) + (1.0 - weight) * (s.alpha + turn)
         s.alpha_var = weight * weight * r + (1.0 - weight) ** 2 * s.alpha_var
         return
     # FKC, eqs 9–24, with z = α_acc − α_gyr.
@@ -216,7 +258,7 @@ def joint_angle(s: Any) -> None:
     p11 = d * d * s.aP[1, 1] + t * t * s.alpha_q[1]
     total = p00 + r
     k0, k1 = p00 / total, p01 / total
-    nu = near(s.alpha_acc - s.alpha_gyr, s.ax[0]) - s.ax[0]
+    nu = axisfit.near(s.alpha_acc - s.alpha_gyr, s.ax[0]) - s.ax[0]
     s.ax[0] += k0 * nu
     s.ax[1] += k1 * nu
     s.aP[0, 0] = (1.0 - k0) ** 2 * p00 + k0 * k0 * r

@@ -215,6 +215,10 @@ class JointSmooth(ChainEstimator):
         kept, self.state[:] = snapshot
         self._kept = list(kept)
 
+    def finds_axes(self) -> bool:
+        """Whether the axes are found from the motion."""
+        return self.params.identify != "off"
+
     def remarks(self) -> list[Remark]:
         """Say whether the axes are known."""
         if any(r.fatal for r in self._found):

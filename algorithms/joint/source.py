@@ -8,7 +8,7 @@ import numpy as np
 
 from ..contract import AlgorithmError, Context, Input, Output, Remark
 from ..parameters import meta
-from . import linear, linear_loop, selfaligned
+from . import linear, linear_loop, selfaligned, turnfit
 from .common import JointEstimator, MergeParams, encoder, imu, joint_name, mounts, per_segment, states_axis
 from .mounting import NOTHING, SIGNS, guess_remarks, mounting_remarks
 
@@ -433,7 +433,7 @@ def axis_remarks(s: Any, segments: tuple[str, ...], fatal: bool = True) -> list[
     if s["learn"] == 0:
         return guess_remarks(s, segments, fatal) if s["sign_by"] == NOTHING else []
     guess = fatal
-    fatal = fatal or bool((s["guessed"] == 2).any())
+    fatal = fatal or bool((s["guessed"] == 2).any() or s["held"])
     if not s["fits"]:
         return [
             Remark("axis_unknown", "too short to find the hinge axes: at least 2 s of motion", fatal=fatal)
@@ -456,6 +456,8 @@ def axis_remarks(s: Any, segments: tuple[str, ...], fatal: bool = True) -> list[
         if still
         else f"both turn as one body (relative turn {s['turn_rms']:.2f} rad/s)"
         if s["turn_rms"] <= 0.1
+        else f"the motion is not that of a hinge (misfit {s['block_cost']:.1f} of at most {turnfit.FITS})"
+        if s["block_cost"] > turnfit.FITS
         else f"sd {sd[0]:.1f}° and {sd[1]:.1f}°, pairing {s['pairing']:.2f} of at least 0.55"
         + (" (each axis is plain, their signs are not: axis near the vertical?)" if max(sd) < 3.0 else "")
     )

@@ -35,6 +35,8 @@ PRIORS, MOST_SD = 18, 3.0
 """Number of priors; a bias of more than so many of their standard deviations is none of a sensor's."""
 MOST_S = 60.0
 """Of longer data the liveliest part is taken: the rest adds time, not information."""
+TRIALS = 20
+"""Evaluations of the misfit, with its derivatives, from each pairing's start."""
 RATE_HZ = 40.0
 """Faster sensors are low-passed and thinned to about this."""
 
@@ -51,7 +53,8 @@ class Hinge(NamedTuple):
     """What was found.
 
     ``axes``, ``positions`` (2, 3) in the sensors' frames, positions from the joint's centre to the sensor;
-    ``axes_cov`` (2, 3, 3), ``axes_sd`` (2,) rad, ``position_sd`` m; ``pairing``: share of the worse pairing's cost in
+    ``axes_cov`` (2, 3, 3), ``axes_sd`` (2,) rad, ``position_sd`` and, of the upper sensor's alone, ``upper_sd`` m;
+    ``pairing``: share of the worse pairing's cost in
     both, 0.5 … 1; ``biases`` of gyroscopes (rad/s) and ``acc_biases`` (m/s²), (2, 3); ``bounded``: whether one of them
     is at the largest that a sensor has, so that something else looks like a bias (tissue, a joint that is no hinge).
     """
@@ -61,6 +64,7 @@ class Hinge(NamedTuple):
     axes_cov: FloatArray
     axes_sd: FloatArray
     position_sd: float
+    upper_sd: float
     pairing: float
     biases: FloatArray
     acc_biases: FloatArray
@@ -172,7 +176,7 @@ class _Problem:
         priors = [p[GYR:ACC] / SD_GYR_BIAS, p[ACC:POS] / SD_ACC_BIAS, p[POS:FIRST] / SD_POSITION]
         return np.concatenate([*out, *priors])
 
-    def solve(self, axes: FloatArray, trials: int) -> tuple[float, list[FloatArray], FloatArray, FloatArray]:
+    def solve(self, axes: FloatArray) -> tuple[float, list[FloatArray], FloatArray, FloatArray]:
         """Return cost, both bases, the unknowns and their covariance, from these axes on."""
         from scipy.optimize import least_squares
 
@@ -190,7 +194,7 @@ class _Problem:
         most[GYR:ACC], most[ACC:POS] = MOST_SD * SD_GYR_BIAS, MOST_SD * SD_ACC_BIAS
         rho: Any = loss  # the stubs of scipy know names only
         solution = least_squares(
-            self.misfit, p, args=(bases,), loss=rho, bounds=(-most, most), x_scale=scale, max_nfev=trials
+            self.misfit, p, args=(bases,), loss=rho, bounds=(-most, most), x_scale=scale, max_nfev=TRIALS
         )
         normal = solution.jac.T @ solution.jac
         spread = max(1.0, 2.0 * float(solution.cost) / max(1, len(solution.fun)))
@@ -214,10 +218,14 @@ def fit(spans: Sequence[Span], axes: FloatArray, band_hz: float, sd_gyr: float, 
         Their standard deviations (rad/s, m/s²).
     """
     problem = _Problem(spans, band_hz, sd_gyr, sd_acc)
-    tries = [problem.solve(np.array([axes[0], sign * axes[1]]), 6) for sign in (1.0, -1.0)]
+    # Both are carried to their ends: half-way the right one may cost more (sit-to-stand, where the shank hardly turns).
+    tries = [problem.solve(np.array([axes[0], sign * axes[1]])) for sign in (1.0, -1.0)]
     tries.sort(key=lambda attempt: attempt[0])
-    pairing = tries[1][0] / (tries[1][0] + tries[0][0])
-    _, bases, p, cov = problem.solve(np.array([b[:, 2] for b in tries[0][1]]), 15)
+    first, second = ([b[:, 2] for b in attempt[1]] for attempt in tries)
+    apart = (first[0] @ second[0]) * (first[1] @ second[1]) < 0.0
+    # Where both starts end in one place the other pairing is no minimum at all.
+    pairing = tries[1][0] / (tries[1][0] + tries[0][0]) if apart else 1.0
+    _, bases, p, cov = tries[0]
     sign = 1.0 if bases[0][:, 2] @ axes[0] >= 0.0 else -1.0
     best_axes = np.array([sign * b[:, 2] for b in bases])
     positions = p[POS:FIRST].reshape(2, 3)
@@ -233,6 +241,7 @@ def fit(spans: Sequence[Span], axes: FloatArray, band_hz: float, sd_gyr: float, 
         axes_cov=axes_cov,
         axes_sd=np.sqrt(np.trace(axes_cov, axis1=1, axis2=2)),
         position_sd=float(np.sqrt(max(0.0, 0.5 * sum(float(np.trace(s)) for s in spread)))),
+        upper_sd=float(np.sqrt(max(0.0, float(np.trace(spread[0]))))),
         pairing=pairing,
         biases=p[GYR:ACC].reshape(2, 3),
         acc_biases=p[ACC:POS].reshape(2, 3),
