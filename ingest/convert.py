@@ -12,7 +12,7 @@ import msgspec
 import polars as pl
 
 from .. import recording as mr
-from ..recording.errors import MarchaError, OutputExists, UsageError, overflow_unsaid
+from ..recording.errors import Finding, MarchaError, OutputExists, UsageError, overflow_unsaid
 from ..recording.files import as_unicode, require_other
 from ..recording.provenance import provenance
 from ..recording.threads import Prefetch, helpers
@@ -34,6 +34,8 @@ from .truth import WALK_FACTS, TruthFile, as_text, read_truth, walk_facts
 from .underlay import is_underlay, read_underlay
 
 T = TypeVar("T")
+MINUTE_NS = 60 * 10**9
+"""An annotation may lie outside of the data by as much, and by as much as they are long."""
 
 
 class ConvertedChannel(msgspec.Struct, frozen=True):
@@ -205,7 +207,7 @@ class _Merged:
                 written.add(topic, table)
         anchors = [*self._floor.anchors, *addresses(imported.attachments)]
         files = [as_unicode(p.name) for p in source.files]
-        self._reports.append((files, radio.finish(watch.finish(imported.report), anchors)))
+        report = radio.finish(watch.finish(imported.report), anchors)
         specs = [*imported.channels, *(spec for spec, _ in truth.tables)] if truth else imported.channels
         for spec, table in truth.tables if truth else ():
             written.declare(spec)
@@ -215,7 +217,9 @@ class _Merged:
             self._records[key if key not in self._records else f"{key}/{name}"] = record
         for marks in (imported.annotations, truth.annotations if truth else None):
             if marks is not None:
-                self.annotations.append(written.moved(marks))
+                near, report = _near(written.moved(marks), written.span(), report)
+                self.annotations.append(near)
+        self._reports.append((files, report))
         raw = _raw(source.files) if options.keep_source else ()
         names = {a.name for a in self.attachments}  # what the user names beside a log goes before its own
         self.attachments += [a for a in (*imported.attachments, *raw) if a.name not in names]
@@ -261,6 +265,28 @@ def _beside(report: Report, floor: Report) -> Report:
     return msgspec.structs.replace(
         report, findings=[*report.findings, *floor.findings], lossy=report.lossy or floor.lossy
     )
+
+
+def _near(marks: pl.DataFrame, span: tuple[int, int] | None, report: Report) -> tuple[pl.DataFrame, Report]:
+    """Return the annotations but those far from the data, which would stretch the recording; these are found."""
+    if span is None:
+        return marks, report
+    first, last = span
+    reach = max(last - first, MINUTE_NS)
+    is_far = (pl.col("start_ns") > last + reach) | (pl.col("end_ns") < first - reach)
+    far = marks.filter(is_far)
+    if far.is_empty():
+        return marks, report
+    label, start_ns = far["label"][0], int(far["start_ns"][0])
+    off_s = max(start_ns - last, first - start_ns) * 1e-9
+    finding = Finding(
+        "annotation_outside",
+        far.height,
+        None,
+        f"{label!r} lies {off_s:.0f} s outside of the data, by more than their whole length; left out",
+    )
+    report = msgspec.structs.replace(report, findings=[*report.findings, finding], lossy=True)
+    return marks.filter(~is_far), report
 
 
 def _apart(sources: Sequence[Path]) -> tuple[list[Path], list[Path]]:
@@ -334,6 +360,12 @@ class _Writer:
     def moved(self, annotations: pl.DataFrame) -> pl.DataFrame:
         """Return annotations on the clock to which the source's messages were moved."""
         return annotations.with_columns(pl.col("start_ns", "end_ns") + self._shift)
+
+    def span(self) -> tuple[int, int] | None:
+        """Return the first and the last time of the present source's messages, None without any."""
+        own = [self._counts[topic][1:] for topic, source in self._from.items() if source == self._source]
+        times = [t for pair in own for t in pair if t is not None]
+        return (min(times), max(times)) if times else None
 
     def channels(self) -> list[ConvertedChannel]:
         return [

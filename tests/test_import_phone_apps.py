@@ -224,6 +224,19 @@ def test_sensor_logger_takes_what_the_user_wrote(tmp_path: Path, walk: PhoneWalk
     assert set(marks["source"]) == {"human"}
 
 
+def test_an_annotation_far_from_the_data_does_not_stretch_the_recording(
+    tmp_path: Path, walk: PhoneWalk
+) -> None:
+    folder = samples.sensor_logger(tmp_path / "log", walk)
+    soon = walk.t_ns[-1] + 30 * 10**9
+    (folder / "Annotation.csv").write_text(f"time,seconds_elapsed,text\n5,0.3,early\n{soon},0.9,soon\n")
+    done = convert(folder, tmp_path / "a.mcap")
+    outside = next(f for f in done.report.findings if f.kind == "annotation_outside")
+    assert (outside.count, outside.detail.split(" ")[0]) == (1, "'early'")
+    assert done.report.lossy
+    assert mr.open(tmp_path / "a.mcap").annotations["label"].to_list() == ["soon"]
+
+
 def test_sensor_logger_of_old_versions_has_no_press(tmp_path: Path, walk: PhoneWalk) -> None:
     folder = samples.sensor_logger(tmp_path / "log", walk)
     rows = f"time,seconds_elapsed,text\n{walk.t_ns[3]},0.3,standing\n{walk.t_ns[9]},0.9,\n"
