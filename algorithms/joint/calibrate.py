@@ -218,7 +218,7 @@ class JointCalibrator(Calibrator):
         mounting.orient(oriented[0], rows, len(rows), lag)
         best = best._replace(axes=o["axis"].copy())
         sd = np.degrees(best.axes_sd)
-        still = [n for n, r in zip((upper, lower), w["rate_rms"], strict=True) if r <= 0.05]
+        still = [n for n, r in zip((upper, lower), w["rate_rms"], strict=True) if r <= hingefit.STILL_RATE]
         why = ""
         if mirrored:
             why = mirrored_remark(mirrored).detail

@@ -39,8 +39,6 @@ BETTER = 0.6
 SPACING_S, STORE = 0.05, 512
 """Samples in motion that are kept for the comparison of neighbours: the first half minute."""
 LEAST_ROWS = 100
-STILL_RATE = 0.05
-"""Rate (rad/s) of all sensors below which a sample is not kept."""
 
 FIELDS: list[Any] = [
     ("hand_rows", "f8", (STORE, 4 * axisfit.WIDTH)),
@@ -173,7 +171,7 @@ def keep(s: Any) -> None:
             for m in range(3):
                 s.hand_turned[i, m] += s.turn[i, m]
                 size += s.gyr[i, m] ** 2
-            moves = moves or size > STILL_RATE * STILL_RATE
+            moves = moves or size > hingefit.STILL_RATE**2
     s.hand_wait += s.dt
     if not moves or s.hand_wait < SPACING_S:
         return

@@ -9,6 +9,8 @@ from ..contract import FloatArray
 from ..numerics.compiled import compiled
 from .axisfit import DGYR, GYR, SUM, WIDTH, fit_axes, fit_position, pairing_misfit
 
+STILL_RATE = 0.05
+"""Rate (rad/s) below which a sensor does not turn: a long rest would crowd the motion out of a store."""
 PAIRED = 0.55
 """Share of the worse pairing's misfit in both above which the axes' signs belong together."""
 DOUBTFUL = 0.7

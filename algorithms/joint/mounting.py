@@ -11,7 +11,7 @@ import numpy as np
 from ..contract import FloatArray, Remark
 from ..numerics.compiled import compiled, inlined
 from ..numerics.records import record_type
-from . import axisfit
+from . import axisfit, hingefit
 
 NEAR = 0.7
 """Cosine (45°) between a found axis and the parameter's: beyond it the parameter says nothing of the sensor."""
@@ -25,8 +25,6 @@ ALIKE, OFTEN = 0.87, 0.25
 """A long axis that is not stated is the convention's where the force is so near it (cosine, 30°) so often (share)."""
 MAINLY = 0.8
 """Share of a sensor's squared rate about the convention's flexion axis above which it is taken where none is found."""
-STILL = 0.05
-"""Root mean square of a rate (rad/s) below which it says nothing."""
 QUIET_RATE, QUIET_FORCE = 1.0, 0.1
 """Rates (rad/s) and share of gravity by which the force differs from it, up to which a force shows the vertical."""
 PLACED = 0.4
@@ -344,7 +342,7 @@ def suppose(s: Any, rows: FloatArray, count: int, lag: int) -> None:
                 along += rate * s.axis[i, m]
                 total += rate * rate
             about += along * along
-        s.about[i] = about / total if total > count * STILL * STILL else 1.0
+        s.about[i] = about / total if total > count * hingefit.STILL_RATE**2 else 1.0
         usual = usual and (s.stated[i] == 1 or s.about[i] > MAINLY)
     if not usual and not stated:
         s.guessed[0], s.guessed[1] = 2, 2

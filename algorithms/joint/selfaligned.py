@@ -16,8 +16,6 @@ from . import axisfit, hingefit, mounting, turnfit
 STORE = 1024
 SETTLED_S = 8.0
 """Motion (s), some strides, from which on the zero that it shows is kept."""
-STILL_RATE = 0.05
-"""Rate (rad/s) of both sensors below which a sample is not kept."""
 
 FIELDS: list[Any] = [
     *axisfit.WORK,
@@ -160,17 +158,17 @@ def hold_mounting(s: Any) -> None:
 @compiled
 def observable(s: Any) -> bool:
     """Return whether the identified axes may be used."""
-    moved = s.turn_rms > 0.1 and s.rate_rms[0] > 0.05 and s.rate_rms[1] > 0.05
+    moved = s.turn_rms > 0.1 and min(s.rate_rms[0], s.rate_rms[1]) > hingefit.STILL_RATE
     return moved and s.axis_sd[0] < 0.05 and s.axis_sd[1] < 0.05 and s.pairing > hingefit.PAIRED
 
 
 @inlined
 def at_rest(s: Any) -> bool:
-    """Return whether neither sensor turns: a long rest would crowd the motion out of the store."""
+    """Return whether neither sensor turns."""
     size = 0.0
     for i in range(2):
         size = max(size, s.gyr[i, 0] ** 2 + s.gyr[i, 1] ** 2 + s.gyr[i, 2] ** 2)
-    return size < STILL_RATE * STILL_RATE
+    return size < hingefit.STILL_RATE**2
 
 
 @compiled

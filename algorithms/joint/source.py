@@ -8,7 +8,7 @@ import numpy as np
 
 from ..contract import AlgorithmError, Context, Input, Output, Remark
 from ..parameters import meta
-from . import linear, linear_loop, selfaligned, turnfit
+from . import hingefit, linear, linear_loop, selfaligned, turnfit
 from .common import JointEstimator, MergeParams, encoder, imu, joint_name, mounts, per_segment, states_axis
 from .mounting import NOTHING, SIGNS, guess_remarks, mounting_remarks
 
@@ -450,7 +450,7 @@ def axis_remarks(s: Any, segments: tuple[str, ...], fatal: bool = True) -> list[
         ]
     if s["hand"]:  # said by JointEstimator.remarks
         return []
-    still = [n for n, rate in zip(segments, s["rate_rms"], strict=False) if rate <= 0.05]
+    still = [n for n, rate in zip(segments, s["rate_rms"], strict=False) if rate <= hingefit.STILL_RATE]
     why = (
         f"{still[0]} never turns"
         if still
