@@ -83,6 +83,16 @@ def test_defects_are_said(tmp_path):
         convert(path, tmp_path / "b.mcap")
 
 
+def test_a_time_beyond_any_clock_is_a_bad_row(tmp_path):
+    path = TestBleMbd().sample(tmp_path)
+    lines = path.read_text().splitlines()
+    lines[20] = "9581252284.75" + lines[20][lines[20].index(",") :]
+    path.write_text("\n".join(lines))
+    (finding,) = [f for f in convert(path, tmp_path / "a.mcap").report.findings if f.kind == "bad_row"]
+    assert (finding.count, finding.first_line) == (1, 21)
+    assert "beyond any clock" in finding.detail
+
+
 @pytest.mark.data
 def test_real_tracks_against_the_optical_truth(data_dir, tmp_path):
     """Calibrated from the calibration folder only; our figures with room for another seed's luck."""

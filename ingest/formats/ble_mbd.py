@@ -20,6 +20,7 @@ import msgspec
 import numpy as np
 import polars as pl
 
+from ...recording.codec import MAX_TIME_NS, SECOND
 from ...recording.errors import MarchaError, UsageError
 from ...recording.rotations import QUAT
 from ..contract import ChannelSpec, CommonOptions, Import, ReportBuilder
@@ -139,7 +140,12 @@ def _parse(path: Path, report: ReportBuilder) -> pl.DataFrame:
             if not width and len(cells) in (4, 16) and matches:
                 width = len(cells)
             if len(cells) == width and matches and _numbers(cells[3:]):
-                good.append(cells)
+                if float(cells[0]) * SECOND <= MAX_TIME_NS:
+                    good.append(cells)
+                else:
+                    report.drop(
+                        "bad_row", f"{path.name}: {row[:40]!r}: time beyond any clock; dropped", line=line
+                    )
                 continue
             if not width:
                 raise MarchaError(
@@ -159,7 +165,7 @@ def _table(rows: Sequence[Sequence[str]]) -> pl.DataFrame:
     # Whole and fractional seconds apart: an epoch in nanoseconds does not fit a float.
     whole = [c[0].partition(".") for c in rows]
     columns: dict[str, Any] = {
-        "t_ns": [int(s) * 1_000_000_000 + int((f + "0" * 9)[:9]) for s, _, f in whole],
+        "t_ns": [int(s) * SECOND + int((f + "0" * 9)[:9]) for s, _, f in whole],
         "mac": [address(c[1]) for c in rows],
         "beacon": [address(c[2]) for c in rows],
     }
