@@ -158,7 +158,7 @@ def test_overlaps_and_instants_have_their_own_places(page: Page) -> None:
     assert [r["start_ns"] == r["end_ns"] for r in rows] == [False, False, True, True]
     lanes = "marcha.stage.lanes.map(l => [l.tier, l.k, l.level.ids.length])"
     wanted = [["gait", 0, 1], ["manual", 0, 2], ["manual", 1, 1]]
-    page.wait_for_function(f"JSON.stringify({lanes}) === '{json.dumps(wanted, separators=(',', ':'))}'")
+    until(page, f"JSON.stringify({lanes}) === '{json.dumps(wanted, separators=(',', ':'))}'")
     # each is found where it is drawn
     for row in rows:
         lane = next(
