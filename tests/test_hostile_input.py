@@ -64,6 +64,15 @@ def test_a_time_beyond_any_clock_is_a_bad_row(tmp_path: Path, time: str) -> None
     assert done.document["channels"][0]["count"] == 300
 
 
+def test_a_time_of_a_table_whose_nanoseconds_leave_decimals_is_a_bad_row(tmp_path: Path) -> None:
+    rows = "".join(f"{'9' * 28 if k == 7 else k * 10},0.{k % 7},1,9.8\n" for k in range(300))
+    done = mapped(tmp_path, MAP.replace('"ns"', '"ms"'), "t,x,y,z\n" + rows)
+    assert done.code == 3
+    (row,) = [f for f in done.document["report"]["findings"] if f["kind"] == "bad_row"]
+    assert (row["count"], row["first_line"]) == (1, 9)
+    assert "beyond any clock" in row["detail"]
+
+
 def test_a_row_without_a_time_is_a_bad_row() -> None:
     report = ReportBuilder()
     repair = TimestampRepair(report, tick_ns=1)

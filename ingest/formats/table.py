@@ -303,9 +303,10 @@ class _File:
         if time.rate_hz is not None:
             count = text.cast(pl.Int64, strict=False).cast(pl.Float64)
             return (count * (1e9 / time.rate_hz)).round(0).cast(pl.Int64, strict=False)
-        # Decimals keep nanoseconds that a float of epoch seconds loses.
+        # Decimals keep nanoseconds that a float of epoch seconds loses; no product may leave them, or whole numbers.
         scale = TICKS_NS[time.unit] // self._tick
-        return (text.cast(pl.Decimal(38, 9), strict=False) * scale).round(0).cast(pl.Int64, strict=False)
+        most = (2**63 - 1) // scale
+        return (text.cast(pl.Decimal(38, 9), strict=False).clip(-most, most) * scale).round(0).cast(pl.Int64)
 
     def _column(
         self, name: str, target: Target, text: pl.Series, lines: pl.Series, subject: str
