@@ -257,7 +257,7 @@ def _one(fig: Figure, walk: _Walk) -> None:
     axes = signals.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for draw, ax in zip(panels, axes, strict=True):
         _time(ax, draw, walk)
-    axes[-1].set_xlabel("time since the start of the recording (s)", fontsize=9)
+    axes[-1].set_xlabel(TIME, fontsize=9)
 
 
 def _time(ax: Axes, draw: Callable[[Axes, _Walk], None], walk: _Walk) -> None:
