@@ -23,7 +23,7 @@ lint: $(VENV)/.stamp-dev
 # pyright reads `marcha.<folder>` of the tests through one link to this folder.
 types: $(VENV)/.stamp-dev
 	mkdir -p .pyright && ln -sfn .. .pyright/marcha
-	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/pyright --threads --pythonpath $(BIN)/python
 
 package: $(VENV)/.stamp-dev
 	$(BIN)/python tests/check_package.py

@@ -59,7 +59,9 @@ def test_planar_and_twist_agree_where_the_joint_is_a_hinge() -> None:
     lower = upper * Rotation.from_rotvec(np.outer(-k, [1, 0, 0]))
     up, low = upper.as_matrix(), lower.as_matrix()
     np.testing.assert_allclose(planar(up[:, :, 2], low[:, :, 2], up[:, :, 0]), k, atol=1e-9)
-    np.testing.assert_allclose(AxisTurn(np.array([1.0, 0, 0])).angle(k, up, low), k, atol=1e-9)
+    about_x = AxisTurn(np.array([1.0, 0, 0])).angle(k, up, low)
+    assert about_x is not None
+    np.testing.assert_allclose(about_x, k, atol=1e-9)
     np.testing.assert_allclose(cardan(up, low)[:, 0], k, atol=1e-9)
 
 
