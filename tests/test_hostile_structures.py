@@ -357,6 +357,18 @@ def test_a_marker_beyond_any_room_is_not_looked_for_endlessly() -> None:
     assert misfit < 0.01
 
 
+def test_a_reference_of_another_type_is_no_position(tmp_path: Path) -> None:
+    from marcha.viz.plan_figures import true_positions
+
+    from .test_recording_foreign import ODD, odd_bytes, raw_writer
+
+    rows = [("/reference/position", k, odd_bytes(k)) for k in range(12)]
+    path = raw_writer(tmp_path / "a.mcap", rows, ("/reference/position",), "pkg/msg/Odd", ODD)
+    with mr.open(path) as rec:
+        assert rec.channels["/reference/position"].count == 12
+        assert true_positions(rec) is None
+
+
 def test_a_marker_whose_name_is_no_utf8_is_read(tmp_path: Path) -> None:
     pytest.importorskip("ezc3d")
     pos = np.arange(60.0).reshape(20, 1, 3)

@@ -54,7 +54,8 @@ def draw_floor(ax: Axes, plan: FloorPlan, *, names: bool = True) -> None:
 def true_positions(rec: Recording) -> Trace | None:
     """Return the reference's positions, None where the recording has none."""
     for topic in ("/reference/pose", "/reference/position"):
-        if topic in rec.channels and rec.channels[topic].count:
+        channel = rec.channels.get(topic)
+        if channel is not None and channel.count and {"pos_x", "pos_y", "pos_z"} <= set(channel.columns):
             table = rec.table(topic)
             trace = Trace(topic, style.REFERENCE)
             z = table["pos_z"].fill_nan(0.0)
