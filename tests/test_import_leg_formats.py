@@ -82,6 +82,15 @@ def kinds(made: object) -> set[str]:
     return {f.kind for f in made.report.findings}  # pyright: ignore[reportAttributeAccessIssue]
 
 
+def test_a_count_of_5000_digits_in_a_head_is_doubted(tmp_path: Path) -> None:
+    path = TestTrc().sample(tmp_path)
+    path.write_text(path.read_text().replace("\t601\t", f"\t{'9' * 5000}\t", 1))
+    findings = convert(path, tmp_path / "r.mcap").report.findings
+    assert [f.detail for f in findings if f.kind == "header_doubt"] == [
+        f"NumFrames is {'9' * 20}, but there are 601 rows"
+    ]
+
+
 @pytest.mark.parametrize(
     ("name", "head"),
     [

@@ -64,8 +64,10 @@ class Trc:
             raise MarchaError(f"{path}, line 4: names no marker")
         report = ReportBuilder()
         stated = facts.get("NumMarkers", "")
-        if stated.isdigit() and int(stated) != len(names):
-            report.note("header_doubt", f"NumMarkers is {stated}, but {len(names)} markers are named", line=3)
+        if stated.isdecimal() and stated.lstrip("0") != str(len(names)):
+            report.note(
+                "header_doubt", f"NumMarkers is {stated[:20]}, but {len(names)} markers are named", line=3
+            )
         columns = ["Frame#", "Time", *(f"{n} {a}" for n in names for a in "XYZ")]
         windows = float_windows(path, text_lines(path, 5), "\t", columns, report)
 
@@ -92,8 +94,8 @@ class Trc:
             if not kept:
                 raise MarchaError(f"{path}: no row has a time; nothing to convert")
             stated = facts.get("NumFrames", "")
-            if stated.isdigit() and int(stated) != count:
-                report.note("header_doubt", f"NumFrames is {stated}, but there are {count} rows", line=3)
+            if stated.isdecimal() and stated.lstrip("0") != str(count):
+                report.note("header_doubt", f"NumFrames is {stated[:20]}, but there are {count} rows", line=3)
 
         device = {"time": "column Time (s)", "rate_hz": facts.get("DataRate", "")}
         return marker_import(frames(), names, report, device, options)
