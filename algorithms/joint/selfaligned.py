@@ -88,7 +88,7 @@ def reset_axes(s: Any) -> None:
 
 @compiled
 def identify(s: Any, lag: int) -> None:
-    """Find the axes, and the position, from the store; judge them (see :func:`verdict`)."""
+    """Find the axes, and the position, from the store; judge them (see :func:`observable`)."""
     n = s.kept
     reset_axes(s)
     paired = hingefit.fit(s, s.rows, n, lag, s.sd_gyr, s.sd_acc, s.gravity, s.learn == 2)
@@ -100,32 +100,34 @@ def identify(s: Any, lag: int) -> None:
         paired = hingefit.fit(s, s.rows, n, lag, s.sd_gyr, s.sd_acc, s.gravity, s.learn == 2)
     s.fits += 1
     s.block_cost = 0.0
-    if s.hand == 0 and not (paired and observable(s)):
+    if s.hand == 0 and moves(s) and not (paired and observable(s)):
         turnfit.fit(s, s.rows, n, lag, s.sd_gyr, s.sd_acc)
         paired = s.block_cost < turnfit.FITS
-    if paired and s.hand == 0 and observable(s):
-        s.known = 1
+    s.known = 1 if paired and s.hand == 0 and observable(s) else 0
+    if s.known == 1:
         mounting.orient(s, s.rows, n, lag)
         hold_mounting(s)
-        if s.learn == 2 and s.pos_sd > 0.05:  # not observable: no lever rather than a wrong one
-            for i in range(2):
-                for m in range(3):
-                    s.pos[i, m] = 0.0
-    elif (
-        s.held == 1 and s.hand == 0
-    ):  # what was found stays, and the remark says that it does not hold any more
-        s.known = 0
+        # Not asked for, or not observable: no lever rather than a wrong one.
+        if s.learn != 2 or s.pos_sd > 0.05:
+            drop_positions(s)
+        return
+    drop_positions(s)
+    s.pos_sd = 1.0
+    if s.held == 1 and s.hand == 0:  # what was found stays; the remark says that it does not hold any more
         for i in range(2):
             for m in range(3):
                 s.axis[i, m] = s.held_axis[i, m]
     else:
-        s.known = 0
         reset_axes(s)
-        for i in range(2):
-            for m in range(3):
-                s.pos[i, m] = 0.0
-        s.pos_sd = 1.0
         mounting.suppose(s, s.rows, n, lag)
+
+
+@compiled
+def drop_positions(s: Any) -> None:
+    """Set the vectors from the joint's centre to zero."""
+    for i in range(2):
+        for m in range(3):
+            s.pos[i, m] = 0.0
 
 
 @compiled
@@ -156,10 +158,15 @@ def hold_mounting(s: Any) -> None:
 
 
 @compiled
+def moves(s: Any) -> bool:
+    """Return whether both sensors turn, and against each other."""
+    return s.turn_rms > 0.1 and min(s.rate_rms[0], s.rate_rms[1]) > hingefit.STILL_RATE
+
+
+@compiled
 def observable(s: Any) -> bool:
     """Return whether the identified axes may be used."""
-    moved = s.turn_rms > 0.1 and min(s.rate_rms[0], s.rate_rms[1]) > hingefit.STILL_RATE
-    return moved and s.axis_sd[0] < 0.05 and s.axis_sd[1] < 0.05 and s.pairing > hingefit.PAIRED
+    return moves(s) and s.axis_sd[0] < 0.05 and s.axis_sd[1] < 0.05 and s.pairing > hingefit.PAIRED
 
 
 @inlined
