@@ -63,11 +63,13 @@ class Trc:
         if not names:
             raise MarchaError(f"{path}, line 4: names no marker")
         report = ReportBuilder()
-        stated = facts.get("NumMarkers", "")
-        if stated.isdecimal() and stated.lstrip("0") != str(len(names)):
-            report.note(
-                "header_doubt", f"NumMarkers is {stated[:20]}, but {len(names)} markers are named", line=3
-            )
+
+        def check_count(key: str, count: int, what: str) -> None:
+            stated = facts.get(key, "")
+            if stated.isdecimal() and stated.lstrip("0") != str(count):
+                report.note("header_doubt", f"{key} is {stated[:20]}, but {what}", line=3)
+
+        check_count("NumMarkers", len(names), f"{len(names)} markers are named")
         columns = ["Frame#", "Time", *(f"{n} {a}" for n in names for a in "XYZ")]
         windows = float_windows(path, text_lines(path, 5), "\t", columns, report)
 
@@ -93,9 +95,7 @@ class Trc:
                 yield times.hstack(marker_table(names, pos))
             if not kept:
                 raise MarchaError(f"{path}: no row has a time; nothing to convert")
-            stated = facts.get("NumFrames", "")
-            if stated.isdecimal() and stated.lstrip("0") != str(count):
-                report.note("header_doubt", f"NumFrames is {stated[:20]}, but there are {count} rows", line=3)
+            check_count("NumFrames", count, f"there are {count} rows")
 
         device = {"time": "column Time (s)", "rate_hz": facts.get("DataRate", "")}
         return marker_import(frames(), names, report, device, options)
