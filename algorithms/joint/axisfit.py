@@ -20,6 +20,7 @@ import numpy as np
 from ..contract import FloatArray
 from ..numerics import cholesky
 from ..numerics.compiled import compiled, inlined
+from ..numerics.rotations import near
 
 # Columns of a sample, for each of two segments: rate, force, rate's derivative, integral of the rate.
 GYR, ACC, DGYR, SUM = 0, 3, 6, 9
@@ -64,12 +65,6 @@ def write_sample(s: Any, row: FloatArray, i: int, turned: FloatArray) -> None:
         row[b + ACC + m] = s.acc[i, m]
         row[b + DGYR + m] = s.dgyr[i, m]
         row[b + SUM + m] = turned[m]
-
-
-@inlined
-def near(angle: float, other: float) -> float:
-    """Return ``angle`` moved by whole turns to within half a turn of ``other``."""
-    return angle - 2.0 * math.pi * math.floor((angle - other) / (2.0 * math.pi) + 0.5)
 
 
 @inlined
@@ -286,7 +281,7 @@ def pairing_misfit(w: Any, rows: FloatArray, count: int, lag: int, sign: float) 
             if abs(upper) + abs(lower) < STILL:
                 continue
             e = b - a - upper + sign * lower
-            e -= 2.0 * math.pi * math.floor(e / (2.0 * math.pi) + 0.5)
+            e = near(e, 0.0)
             total += min(e * e, 0.25)
             used += 1
     return total / used if used > 20 else math.nan
@@ -477,20 +472,26 @@ def fit_position(w: Any, rows: FloatArray, count: int, sd: float) -> None:
     for i in range(6):
         w.N[i, i] += 1.0
     invert(w, 6)
-    scale = max(1.0, cost / count)
-    total = 0.0
+    settle_positions(w, 0, max(1.0, cost / count))
+
+
+@compiled
+def settle_positions(w: Any, first: int, scale: float) -> None:
+    """Fill the positions' deviations across the axes; move the part along them by eq 72.
+
+    Their covariance over ``scale`` stands in ``w.cov`` from row ``first`` on.
+    """
+    total, along = 0.0, 0.0
     for i in range(2):
         for m in range(3):
-            total += scale * w.cov[3 * i + m, 3 * i + m]
+            row = first + 3 * i + m
+            total += scale * w.cov[row, row]
+            along += 0.5 * w.pos[i, m] * w.axis[i, m]
             for k in range(3):
-                total -= scale * w.axis[i, m] * w.cov[3 * i + m, 3 * i + k] * w.axis[i, k]
+                total -= scale * w.axis[i, m] * w.cov[row, first + 3 * i + k] * w.axis[i, k]
         if i == 0:
             w.upper_sd = math.sqrt(max(0.0, total))
     w.pos_sd = math.sqrt(max(0.0, 0.5 * total))
-    along = 0.0
-    for i in range(2):
-        for m in range(3):
-            along += 0.5 * w.pos[i, m] * w.axis[i, m]
     for i in range(2):
         for m in range(3):
             w.pos[i, m] -= along * w.axis[i, m]

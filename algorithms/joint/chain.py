@@ -26,8 +26,8 @@ import numpy as np
 
 from ..contract import FloatArray
 from ..numerics.compiled import compiled
+from ..numerics.rotations import near
 from . import merge, selfaligned
-from .axisfit import near
 from .chain_turn import square, turn
 from .chain_zero import axis_unknown, spread_of_zero
 

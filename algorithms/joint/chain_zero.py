@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from ..numerics.compiled import compiled
-from .axisfit import near
+from ..numerics.rotations import near
 from .mounting import GUESS_DEG, NOTHING, guess_deg
 
 GUESS = math.radians(GUESS_DEG)

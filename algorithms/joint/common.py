@@ -130,14 +130,19 @@ def mount_of(axis: FloatArray, up: FloatArray | None) -> FloatArray:
 def mounts(params: Any, segments: Sequence[str], context: Context | None) -> FloatArray:
     """Return sensor-to-segment rotations (n, 3, 3): by the joint calibration, else by the parameters."""
     result = np.zeros((len(segments), 3, 3))
-    calibration = context.calibrations.get("joint") if context is not None else None
     for i, segment in enumerate(segments):
-        key = f"rot_sb_{segment}"
-        if calibration is not None and calibration.usable and key in calibration.values:
-            result[i] = calibration.array(key)
-        else:
-            result[i] = given_mount(params, segment)
+        mount = calibrated_mount(context, segment)
+        result[i] = given_mount(params, segment) if mount is None else mount
     return result
+
+
+def calibrated_mount(context: Context | None, segment: str) -> FloatArray | None:
+    """Return the sensor-to-segment rotation (3, 3) of the joint calibration; None where it has none."""
+    calibration = context.calibrations.get("joint") if context is not None else None
+    key = f"rot_sb_{segment}"
+    if calibration is None or not calibration.usable or key not in calibration.values:
+        return None
+    return calibration.array(key)
 
 
 def given_mount(params: Any, segment: str) -> FloatArray:
@@ -273,7 +278,8 @@ class JointEstimator(KernelEstimator):
                 off_deg = math.degrees(math.acos(min(1.0, abs(float(axis @ own)))))
                 if off_deg <= OTHER_AXIS_DEG:
                     continue
-                stated = self._axis_stated(name)
+                calibrated = calibrated_mount(self.context, name) is not None
+                stated = calibrated or states_axis(self.params, name, self.context.channels)
                 which = (
                     "the stated axis" if stated else "x, taken where axis is not stated: its angles are wrong"
                 )
@@ -286,13 +292,6 @@ class JointEstimator(KernelEstimator):
                     )
                 )
         return remarks
-
-    def _axis_stated(self, segment: str) -> bool:
-        calibration = self.context.calibrations.get("joint")
-        calibrated = (
-            calibration is not None and calibration.usable and f"rot_sb_{segment}" in calibration.values
-        )
-        return calibrated or states_axis(self.params, segment, self.context.channels)
 
     def snapshot(self) -> Any:
         """Return a copy of the packed state."""

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from ..numerics.compiled import compiled
+from ..numerics.rotations import near
 from . import merge, selfaligned
-from .axisfit import near
 
 LOCAL, GLOBAL, ONE, SELF = 0, 1, 2, 3  # kinds: FKL; FKG; SMp and SMe; SMeA
 DROP, ZERO, HOLD = 0, 1, 2

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..contract import FloatArray, Remark
+from ..numerics import rotations
 from ..numerics.compiled import compiled, inlined
 from ..numerics.records import record_type
 from . import axisfit, hingefit
@@ -114,8 +115,8 @@ def lean(s: Any, rows: FloatArray, k: int, i: int) -> float:
 
 @inlined
 def bin_of(angle: float) -> int:
-    """Return the bin of an angle within half a turn of 0."""
-    return min(BINS - 1, int((angle + math.pi) / (2.0 * math.pi) * BINS))
+    """Return the bin of an angle, whole turns left out."""
+    return min(BINS - 1, int((rotations.near(angle, 0.0) + math.pi) / (2.0 * math.pi) * BINS))
 
 
 @compiled
@@ -138,7 +139,7 @@ def find_pose(s: Any, rows: FloatArray, count: int) -> None:
     for k in range(count):
         upper, lower = lean(s, rows, k, 0), lean(s, rows, k, 1)
         if math.isfinite(upper) and math.isfinite(lower):
-            b = bin_of(axisfit.near(upper - lower, 0.0))
+            b = bin_of(upper - lower)
             s.quiet[b] += 1.0
             s.upright[b] += math.cos(upper)
             total += 1.0
@@ -156,7 +157,7 @@ def find_pose(s: Any, rows: FloatArray, count: int) -> None:
     for k in range(count):
         upper, lower = lean(s, rows, k, 0), lean(s, rows, k, 1)
         quiet = math.isfinite(upper) and math.isfinite(lower)
-        if quiet and abs(bin_of(axisfit.near(upper - lower, 0.0)) - straight) <= 2:
+        if quiet and abs(bin_of(upper - lower) - straight) <= 2:
             for i in range(2):
                 for m in range(3):
                     s.pose_up[i, m] += rows[k, axisfit.WIDTH * i + axisfit.ACC + m]
@@ -199,17 +200,15 @@ def set_long_axes(s: Any, rows: FloatArray, count: int) -> None:
         often = force_across(s, rows, count, i)
         usual = abs(near) > NEAR and (s.stated[i] == 1 or often > OFTEN)
         s.guessed[i] = 0 if (abs(beside) < 0.9 if s.up_stated[i] == 1 else usual) else 1
-        if s.pose != 0.0:
-            for m in range(3):
-                s.mean_force[m] = s.pose_up[i, m]
         size, least = 0.0, 0
         for m in range(3):
-            size += s.mean_force[m] ** 2
+            s.up[i, m] = s.pose_up[i, m] if s.pose != 0.0 else s.mean_force[m]
+            size += s.up[i, m] ** 2
             if abs(s.axis[i, m]) < abs(s.axis[i, least]):
                 least = m
         for m in range(3):
             if size > 1.0:
-                s.up[i, m] = s.mean_force[m] / math.sqrt(size)
+                s.up[i, m] /= math.sqrt(size)
             else:
                 s.up[i, m] = 1.0 if m == least else 0.0
     # One sensor that happens to lie by the convention beside one that does not proves nothing.
@@ -252,7 +251,7 @@ def skewness(w: Any, rows: FloatArray, count: int, lag: int) -> float:
         for n in range(first, last + 1, lag):
             mean += turned(w, rows, n)
         e = turned(w, rows, k) - mean / ((last - first) // lag + 1)
-        w.swings[bin_of(axisfit.near(e, 0.0))] += 1.0
+        w.swings[bin_of(e)] += 1.0
         square += e * e
         cube += e * e * e
     square /= count

@@ -11,6 +11,7 @@ import math
 from typing import Any
 
 from ..numerics.compiled import compiled, inlined
+from ..numerics.rotations import near
 from . import axisfit, hingefit, mounting, turnfit
 
 STORE = 1024
@@ -239,7 +240,7 @@ def joint_angle(s: Any) -> None:
     uu, vv = ux * ux + uy * uy, vx * vx + vy * vy
     g2 = s.gravity * s.gravity
     s.alpha_spread = 0.5 * (g2 / max(uu, 1e-6 * g2) + g2 / max(vv, 1e-6 * g2))
-    s.alpha_acc = axisfit.near(math.atan2(ux * vy - uy * vx, ux * vx + uy * vy), s.alpha)
+    s.alpha_acc = near(math.atan2(ux * vy - uy * vx, ux * vx + uy * vy), s.alpha)
     if s.alpha_on == 0:
         s.alpha_gyr = s.alpha_acc
         s.alpha = s.alpha_acc
@@ -251,7 +252,7 @@ def joint_angle(s: Any) -> None:
     r = s.alpha_r * max(1.0, s.alpha_spread)
     if s.alpha_seel == 1:
         weight = s.alpha_lambda / max(1.0, s.alpha_spread)
-        s.alpha = weight * axisfit.near(s.alpha_acc, s.alpha) + (1.0 - weight) * (s.alpha + turn)
+        s.alpha = weight * near(s.alpha_acc, s.alpha) + (1.0 - weight) * (s.alpha + turn)
         s.alpha_var = weight * weight * r + (1.0 - weight) ** 2 * s.alpha_var
         return
     # FKC, eqs 9–24, with z = α_acc − α_gyr.
@@ -263,7 +264,7 @@ def joint_angle(s: Any) -> None:
     p11 = d * d * s.aP[1, 1] + t * t * s.alpha_q[1]
     total = p00 + r
     k0, k1 = p00 / total, p01 / total
-    nu = axisfit.near(s.alpha_acc - s.alpha_gyr, s.ax[0]) - s.ax[0]
+    nu = near(s.alpha_acc - s.alpha_gyr, s.ax[0]) - s.ax[0]
     s.ax[0] += k0 * nu
     s.ax[1] += k1 * nu
     s.aP[0, 0] = (1.0 - k0) ** 2 * p00 + k0 * k0 * r

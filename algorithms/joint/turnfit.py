@@ -13,7 +13,18 @@ from typing import Any
 
 from ..contract import FloatArray
 from ..numerics.compiled import compiled
-from .axisfit import GYR, SUM, WIDTH, add_normal, centre_force, huber, invert, set_tangent, solve
+from .axisfit import (
+    GYR,
+    SUM,
+    WIDTH,
+    add_normal,
+    centre_force,
+    huber,
+    invert,
+    set_tangent,
+    settle_positions,
+    solve,
+)
 
 UNKNOWNS = 10
 """Both axes in their tangent planes, both positions."""
@@ -133,8 +144,13 @@ def window_misfit(
 def cost_of(
     w: Any, rows: FloatArray, count: int, block: int, sd_gyr: float, sd_acc: float, normal: bool
 ) -> float:
-    """Return the cost at ``w.from_axis``, ``w.from_pos``; with ``normal`` also the normal equations."""
+    """Return the cost at ``w.from_axis``, ``w.from_pos``; with ``normal`` also tangents and normal equations."""
     total = 0.0
+    if normal:
+        for i in range(2):
+            for m in range(3):
+                w.axis[i, m] = w.from_axis[i, m]
+            set_tangent(w, i)
     for a in range(UNKNOWNS):
         w.rhs[a] = 0.0
         for b in range(UNKNOWNS):
@@ -165,11 +181,6 @@ def cost_of(
 def descend(w: Any, rows: FloatArray, count: int, block: int, sd_gyr: float, sd_acc: float) -> float:
     """Improve ``w.from_axis`` and ``w.from_pos`` by damped Gauss-Newton steps; return the cost."""
     damping = 1e-3
-    for i in range(2):
-        for m in range(3):
-            w.axis[i, m] = w.from_axis[i, m]
-    set_tangent(w, 0)
-    set_tangent(w, 1)
     cost = cost_of(w, rows, count, block, sd_gyr, sd_acc, True)
     for _ in range(STEPS):
         if not solve(w, UNKNOWNS, damping):
@@ -197,11 +208,6 @@ def descend(w: Any, rows: FloatArray, count: int, block: int, sd_gyr: float, sd_
             damping *= 20.0
             if damping > 1e6:
                 break
-        for i in range(2):
-            for m in range(3):
-                w.axis[i, m] = w.from_axis[i, m]
-        set_tangent(w, 0)
-        set_tangent(w, 1)
         cost = cost_of(w, rows, count, block, sd_gyr, sd_acc, True)
         if step < 1e-10 and tried <= cost * (1.0 + 1e-12):
             break
@@ -236,34 +242,13 @@ def fit(w: Any, rows: FloatArray, count: int, block: int, sd_gyr: float, sd_acc:
     w.pairing = costs[1 - better] / (costs[0] + costs[1]) if upper * lower < 0.0 else 1.0
     for i in range(2):
         for m in range(3):
-            w.from_axis[i, m] = w.axis[i, m] = w.end_axis[better, i, m]
+            w.from_axis[i, m] = w.end_axis[better, i, m]
             w.from_pos[i, m] = w.end_pos[better, i, m]
-    set_tangent(w, 0)
-    set_tangent(w, 1)
     w.cost = cost_of(w, rows, count, block, sd_gyr, sd_acc, True)
     vary(w, -1, 0.0)
     w.block_cost = w.cost / (5.0 * count / block)
-    spread(w)
-
-
-@compiled
-def spread(w: Any) -> None:
-    """Fill the deviations of axes and positions from the normal equations; move the part along the axes to zero."""
     invert(w, UNKNOWNS)
     scale = max(1.0, w.block_cost)
-    both, along = 0.0, 0.0
     for i in range(2):
         w.axis_sd[i] = math.sqrt(scale * max(0.0, w.cov[2 * i, 2 * i] + w.cov[2 * i + 1, 2 * i + 1]))
-        across = 0.0
-        for m in range(3):
-            across += w.cov[4 + 3 * i + m, 4 + 3 * i + m]
-            along += 0.5 * w.pos[i, m] * w.axis[i, m]
-            for n in range(3):
-                across -= w.axis[i, m] * w.cov[4 + 3 * i + m, 4 + 3 * i + n] * w.axis[i, n]
-        both += 0.5 * max(0.0, scale * across)
-        if i == 0:
-            w.upper_sd = math.sqrt(max(0.0, scale * across))
-    w.pos_sd = math.sqrt(both)
-    for i in range(2):
-        for m in range(3):
-            w.pos[i, m] -= along * w.axis[i, m]
+    settle_positions(w, 4, scale)

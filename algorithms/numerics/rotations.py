@@ -16,6 +16,12 @@ from .compiled import compiled, inlined
 FloatArray = NDArray[np.float64]
 
 
+@inlined
+def near(angle: float, other: float) -> float:
+    """Return ``angle`` moved by whole turns to within half a turn of ``other``."""
+    return angle - 2.0 * math.pi * math.floor((angle - other) / (2.0 * math.pi) + 0.5)
+
+
 @compiled
 def set_rpy(rot: FloatArray, roll: float, pitch: float, yaw: float) -> None:
     """Set ``rot`` to ``Rz(yaw) Ry(pitch) Rx(roll)``."""
