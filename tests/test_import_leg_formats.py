@@ -82,6 +82,28 @@ def kinds(made: object) -> set[str]:
     return {f.kind for f in made.report.findings}  # pyright: ignore[reportAttributeAccessIssue]
 
 
+@pytest.mark.data
+def test_half_a_capture_says_that_it_is_cut_off(data_dir: Path, tmp_path: Path) -> None:
+    pytest.importorskip("ezc3d")
+    for name, whole, there in (("walking2.c3d", 1249, 621), ("walk_free_01.trc", 900, 37)):
+        data = (data_dir / "leg" / "optical_formats" / name).read_bytes()
+        (tmp_path / name).write_bytes(data[: len(data) // 2])
+        report = convert(tmp_path / name, tmp_path / f"{name}.mcap").report
+        (doubt,) = [f.detail for f in report.findings if f.kind == "header_doubt"]
+        assert str(whole) in doubt
+        assert str(there) in doubt
+        assert report.lossy
+
+
+def test_an_orientation_that_no_row_has_is_an_empty_channel(tmp_path: Path) -> None:
+    """The only row was cut off behind its first orientation."""
+    head = "DataType=Quaternion\nversion=3\nendheader\ntime\tpelvis_imu\ttorso_imu\n"
+    (tmp_path / "a.sto").write_text(f"{head}417\t1,0,0,0\t0.4,0.5")
+    done = convert(tmp_path / "a.sto", tmp_path / "r.mcap")
+    assert [c.count for c in done.channels] == [1, 0]
+    assert {f.kind for f in done.report.findings} == {"no_rotation"}
+
+
 def test_a_count_of_5000_digits_in_a_head_is_doubted(tmp_path: Path) -> None:
     path = TestTrc().sample(tmp_path)
     path.write_text(path.read_text().replace("\t601\t", f"\t{'9' * 5000}\t", 1))

@@ -165,7 +165,7 @@ def _joints(
 def _orientations(
     names: Sequence[str], windows: Windows, report: ReportBuilder, device: dict[str, str], *, turn: bool
 ) -> Import:
-    specs = [ChannelSpec(f"/reference/{n}/orientation", ORIENTATION, "optical") for n in names]
+    specs = [ChannelSpec(f"/reference/{n}/orientation", ORIENTATION, "optical", QUAT) for n in names]
 
     def tables() -> Iterator[TimedTables]:
         for values, rows in windows:

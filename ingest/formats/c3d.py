@@ -96,6 +96,11 @@ class C3d:
         report = ReportBuilder()
         if not head["units"]:
             report.note("unit_doubt", "POINT:UNITS is missing: positions taken for mm, as C3D has by default")
+        if len(pos) < head["stated_frames"]:
+            report.loss(
+                "header_doubt",
+                f"the header states {head['stated_frames']} frames, {len(pos)} are there: the file is cut off",
+            )
         rate = head["rate_hz"]
         possible_rate(rate, path, "set POINT:RATE")
         t_ns = nanoseconds(head["first_frame"] + np.arange(len(pos)), 1e9 / rate)
@@ -192,8 +197,8 @@ def _read(path: Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
     if not path.is_file():
         raise MarchaError(f"{path}: no such file")
     with path.open("rb") as file:
-        start = file.read(2)
-        if start[1:] != b"\x50":
+        start = file.read(10)
+        if start[1:2] != b"\x50":
             raise MarchaError(f"{path}: not a C3D file: its second byte is not 80")
         file.seek(max(start[0] - 1, 0) * 512 + 3)
         if file.read(1) == _MIPS:
@@ -218,6 +223,8 @@ def _read(path: Path) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
         raise MarchaError(f"{path}: a damaged C3D file ({why}); export it again")
     # Names of markers are in whatever encoding the system had; other bytes than UTF-8 become a question mark.
     facts = json.loads(json.dumps(json.loads(head), ensure_ascii=False).encode("utf-8", "replace"))
+    first, last = np.frombuffer(start[6:], "<u2").tolist() if len(start) == 10 else (1, 0)
+    facts["stated_frames"] = last - first + 1  # ezc3d states those that it found
     size = int(np.prod(facts["shape"]))
     numbers = np.frombuffer(data, "<f8")
     pos = numbers[:size].reshape(facts["shape"]).astype(float)

@@ -109,7 +109,7 @@ class MpuEncoderMat:
             parts = [quats[f"quat{k}{q}"] for q in range(1, 5)]
             if all(p in values for p in parts):
                 metadata = {"source": "the device's own (DMP)"}
-                spec = ChannelSpec(f"/leg/{name}/orientation", ORIENTATION, f"{name}_imu", metadata=metadata)
+                spec = ChannelSpec(f"/leg/{name}/orientation", ORIENTATION, f"{name}_imu", QUAT, metadata)
                 turned = pl.DataFrame({q: values[p] for q, p in zip(QUAT, parts, strict=True)})
                 tables.append((spec, turned))
         first, second = names.values()

@@ -66,8 +66,9 @@ class Trc:
 
         def check_count(key: str, count: int, what: str) -> None:
             stated = facts.get(key, "")
-            if stated.isdecimal() and stated.lstrip("0") != str(count):
-                report.note("header_doubt", f"{key} is {stated[:20]}, but {what}", line=3)
+            if stated.isdecimal() and float(stated) != count:
+                say = report.loss if float(stated) > count else report.note  # more were there
+                say("header_doubt", f"{key} is {stated[:20]}, but {what}", line=3)
 
         check_count("NumMarkers", len(names), f"{len(names)} markers are named")
         columns = ["Frame#", "Time", *(f"{n} {a}" for n in names for a in "XYZ")]
